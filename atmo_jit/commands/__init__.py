@@ -1,0 +1,1 @@
+"""The subcommands of ``atmo-jit``: one module each, with a click command named ``command``."""

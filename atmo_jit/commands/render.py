@@ -1,0 +1,219 @@
+"""``atmo-jit render``: a Mitsuba scene to a linear OpenEXR and a tone-mapped PNG beside it."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from atmo_jit import __version__, scenes
+from atmo_jit.errors import InputError, one_line
+from atmo_jit.files import atomic_outputs, check_output
+from atmo_jit.image import Picture, display, luminance, write_exr, write_png
+from atmo_jit.progress import progress_bar
+
+# Camera samples of one pass: bounds the memory (about 0.1 KiB each) and keeps the bar moving on small machines.
+PASS_SAMPLES = 2**21
+# A picture takes at least this many passes where it has the samples for it, so that the bar moves.
+LEAST_PASSES = 16
+
+
+@click.command()
+@click.argument("scene", required=False)
+@click.option("--out", type=click.Path(path_type=Path), help="Picture to write, .exr; a .png goes beside it.")
+@click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel in place of the scene's.")
+@click.option("--width", type=click.IntRange(1, 65536), help="Width in pixels; without --height the proportions stay.")
+@click.option("--height", type=click.IntRange(1, 65536), help="Height in pixels; without --width the proportions stay.")
+@click.option("--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba variant.")
+@click.option(
+    "-D", "definitions", multiple=True, metavar="NAME=VALUE", help="Set a parameter of the scene; repeatable."
+)
+@click.option("--exposure", type=float, default=0.0, metavar="EV", help="Stops around the PNG's automatic exposure.")
+@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@click.option("--list", "list_scenes", is_flag=True, help="Name the shipped scenes and stop.")
+def command(
+    scene: str | None,
+    out: Path | None,
+    spp: int | None,
+    width: int | None,
+    height: int | None,
+    variant: str,
+    definitions: tuple[str, ...],
+    exposure: float,
+    quiet: bool,
+    list_scenes: bool,
+) -> None:
+    """Render SCENE, a shipped scene's name or an .xml or .json file, to a linear OpenEXR and a PNG.
+
+    \b
+    atmo-jit render noon --out noon.exr
+    atmo-jit render sunset --out sunset.exr --spp 256 --width 1280 -D mie_g=0.8
+    """
+    if list_scenes:
+        for name, path in scenes.shipped().items():
+            click.echo(f"{name:<10} {scenes.purpose(path)}")
+        return
+    if scene is None:
+        raise InputError("SCENE is missing; give a file or one of the shipped scenes: " + ", ".join(scenes.shipped()))
+    if out is None:
+        raise InputError("--out is missing; give the .exr file to write")
+    if not -100.0 <= exposure <= 100.0:  # also refuses NaN
+        raise InputError(f"--exposure is {exposure}; must be a number of stops from -100 to 100")
+    exr, png = check_output(out, ".exr"), check_output(out.with_suffix(".png"), ".png")
+    path = scenes.find(scene)
+    parameters = _parameters(definitions)
+
+    started = time.perf_counter()
+    with _mitsuba(variant):
+        from atmo_jit.scenes.reader import load_scene
+
+        loaded = load_scene(path, parameters, width=width, height=height)
+        with progress_bar(f"rendering {path.stem}", quiet=quiet) as advance:
+            picture, samples = render_picture(loaded, spp, advance)
+    seconds = time.perf_counter() - started
+
+    metadata = {
+        "software": f"atmo-jit {__version__}",
+        "scene": path.name,
+        "parameters": " ".join(f"{name}={value}" for name, value in parameters.items()),
+        "variant": variant,
+        "samplesPerPixel": samples,
+        "renderSeconds": seconds,
+    }
+    with atomic_outputs(exr, png) as (exr_part, png_part):
+        write_exr(exr_part, picture, metadata)
+        write_png(png_part, display(picture.rgb, exposure))
+    invalid = int(picture.invalid.sum())
+    if invalid:
+        _warn(f"{invalid} of {picture.invalid.size} pixels are NaN or infinite: kept in {exr.name}, magenta in {png.name}")
+    if not quiet:
+        rows, columns = picture.pixels.shape[:2]
+        click.echo(f"{out} and {png.name}: {columns}x{rows}, {samples} samples per pixel, {seconds:.1f} s")
+
+
+def render_picture(scene: Any, spp: int | None, advance: Callable[[float], None]) -> tuple[Picture, int]:
+    """Render with the scene's integrator and first sensor, in passes of different seeds, and return it with its spp.
+
+    spp: samples per pixel, None for the sensor's own number. Samplers that cannot take a number take the next larger
+        one; the second result is the number really used.
+    advance: called with the fraction done after every pass.
+
+    The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
+    estimate that one pass with all samples would give.
+    """
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    film, sampler = sensor.film(), sensor.sampler()
+    total, done = spp or sampler.sample_count(), 0
+    pixels = int(np.prod(film.crop_size()))
+    sums: np.ndarray | float = 0.0
+    samples = 0
+    for seed, count in enumerate(pass_sizes(total, pixels)):
+        integrator.render(scene, sensor, seed=seed, spp=count, develop=False, evaluate=True)
+        sums = sums + np.array(film.develop(raw=True), dtype=np.float64)
+        samples += sampler.sample_count()
+        done += count
+        advance(done / total)
+    return _developed(film, sums), samples
+
+
+def pass_sizes(spp: int, pixels: int) -> Iterator[int]:
+    """Samples per pixel of each pass: powers of two, so that all passes of one picture share a compiled kernel."""
+    most = max(1, min(spp // LEAST_PASSES, PASS_SAMPLES // pixels))
+    size = 1 << (most.bit_length() - 1)
+    if spp >= 4:
+        size = max(size, 4) if 4 * pixels <= PASS_SAMPLES else size
+    while spp:
+        while size > spp:
+            size //= 2
+        yield size
+        spp -= size
+
+
+def _developed(film: Any, sums: np.ndarray) -> Picture:
+    """A film's weighted sums over its weights: red, green, blue or luminance, alpha, then the integrator's extras."""
+    names = [field.name for field in film.bitmap(raw=True).struct_()]
+    if "W" not in names or "R" not in names:
+        raise InputError(f"the scene's film gives the channels {', '.join(names)}; must be an hdrfilm")
+    weight = sums[..., names.index("W"), None]
+    values = np.divide(sums, weight, out=np.zeros_like(sums), where=weight != 0.0)
+    planes = {name: values[..., index] for index, name in enumerate(names) if name != "W"}
+    developed = [field.name for field in film.bitmap().struct_()]
+    if developed[0] == "Y":
+        grey = luminance(np.stack([planes.pop(name) for name in "RGB"], axis=-1))
+        planes = {"Y": grey, **planes}
+    return Picture(np.stack(list(planes.values()), axis=-1).astype(np.float32), tuple(planes))
+
+
+def _parameters(definitions: tuple[str, ...]) -> dict[str, str]:
+    """The scene parameters of all -D options. Raises InputError for one that is not NAME=VALUE."""
+    parameters = {}
+    for definition in definitions:
+        name, equals, value = definition.partition("=")
+        if not (equals and name):
+            raise InputError(f"-D {definition}: must be NAME=VALUE")
+        parameters[name] = value
+    return parameters
+
+
+@contextmanager
+def _mitsuba(variant: str) -> Iterator[None]:
+    """Mitsuba with a variant set, this package's plugins registered and its log turned into warnings on stderr.
+
+    Raises InputError when the variant is not in this build of Mitsuba or its backend does not start.
+    """
+    if variant.startswith("llvm"):
+        from atmo_jit.llvm import require_llvm
+
+        require_llvm()
+    import mitsuba as mi
+
+    if variant not in mi.variants():
+        raise InputError(f"--variant is {variant!r}; this Mitsuba has {', '.join(mi.variants())}")
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:
+        raise InputError(f"--variant {variant} does not start here: {one_line(str(error))}") from None
+
+    class Warnings(mi.Appender):
+        """Mitsuba's warnings, each as one line, once."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.seen: set[str] = set()
+
+        def append(self, level: Any, text: str) -> None:
+            text = one_line(re.sub(r"^\S+ \S+ WARN\s+", "", text))
+            if text not in self.seen:
+                self.seen.add(text)
+                _warn(text)
+
+        def log_progress(self, *args: Any) -> None:
+            """Mitsuba's own progress: this command has its bar."""
+
+    logger = mi.logger()
+    level = logger.log_level()
+    former = [logger.appender(index) for index in range(logger.appender_count())]
+    logger.clear_appenders()
+    logger.add_appender(Warnings())
+    logger.set_log_level(mi.LogLevel.Warn)
+    try:
+        from atmo_jit.plugins import register
+
+        register()
+        yield
+    finally:
+        logger.clear_appenders()
+        for appender in former:
+            logger.add_appender(appender)
+        logger.set_log_level(level)
+
+
+def _warn(text: str) -> None:
+    print(f"atmo-jit: warning: {text}", file=sys.stderr)

@@ -1,0 +1,130 @@
+"""The solved radiance field: harmonic moments of the light of all orders at the nodes, and what it scatters toward a view ray.
+
+A field stores, per altitude node, sun node and channel, a positive reference (the zeroth moment of order 1) and every moment divided by it.
+The reference is interpolated in its logarithm, the quotients linearly: at twilight light falls by a factor of two per degree, and linear
+interpolation of the moments themselves would be wrong by 8 %.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from .backend import floats, packet, padded, types
+from .grid import Grid
+from .harmonics import pair_count, pairs, recurrence
+from .optics import Optics
+from .refinement import Order, Refinement
+
+
+class Field:
+    """The light of a sum of orders at the refined nodes.
+
+    ``light``: its moments scatter once more (None: nothing does); ``sky``: irradiance [K, S, size] of the light that arrives, which may be of
+    one order more.
+    """
+
+    def __init__(self, optics: Optics, grid: Grid, refine: Refinement, light: Order | None, sky: Any) -> None:
+        self.optics, self.grid = optics, grid
+        self.log_reference = refine.log_reference
+        self.sky = refine.both(sky)
+        self.light = light
+        if light is None:
+            return
+        self.degree = light.degree
+        self.moments, self.reflected = refine.both(light.moments), refine.both(light.sky)
+        chi = [optics.phase_moments(k, self.degree) for k in optics.scatterers]
+        self._chi = _interleave([[chi[i][c] for c in range(optics.channel_count)] for i in range(len(chi))], self.degree)
+        l_, m = pairs(self.degree)
+        self._recurrence = floats([[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)])
+        self._l = floats(l_)
+
+    def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
+        """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude [2][channel]."""
+        suns, size = self.grid.sources, padded(self.optics.channel_count)
+        k, fk = self.grid.locate_altitude(h)
+        s, fs = self.grid.locate_sun(mu_s)
+        first = k * suns + s
+        nodes = [first, first + 1, first + suns, first + suns + 1]
+        weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
+        logs = [packet(self.log_reference, node, size, active) for node in nodes]
+        channels = range(self.optics.channel_count)
+        return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
+
+    def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
+        """Irradiance of the scattered light on a horizontal surface facing up, per channel.
+
+        ``reflected``: only of the light whose reflection by that surface is still counted. Between two levels it is interpolated
+        geometrically: above the ground it falls with the air that is left above.
+        """
+        buffer = self.reflected if reflected else self.sky
+        channels, size, suns = self.optics.channel_count, padded(self.optics.channel_count), self.grid.sources
+        k, fk = self.grid.locate_altitude(h)
+        s, fs = self.grid.locate_sun(mu_s)
+        levels = []
+        for node in (k * suns + s, (k + 1) * suns + s):
+            logs = [packet(self.log_reference, node + i, size, active) for i in (0, 1)]
+            values = [packet(buffer, node + i, size, active) for i in (0, 1)]
+            levels.append([dr.exp(dr.lerp(*(v[c] for v in logs), fs)) * dr.lerp(*(v[c] for v in values), fs) for c in range(channels)])
+        return [_geometric(dr.maximum(a, 0.0), dr.maximum(b, 0.0), fk) for a, b in zip(*levels, strict=True)]
+
+    def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
+        """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel] (march.Source)."""
+        t = types()
+        channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
+        size = padded(channels)
+        nodes, weights, scales = self._corners(h, mu_s, active)
+        sine = dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
+        count = pair_count(self.degree)
+        stride = dr.opaque(t.UInt, count, 1)
+
+        def pair(i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]) -> tuple[Any, ...]:
+            a, b, start, is_diagonal = packet(self._recurrence, i, 4, active)
+            new_m = start > 0.0
+            diagonal = dr.select(new_m, diagonal * sine * start, diagonal)
+            next_cos = dr.select(new_m, 2.0 * cos_phi * cos_m - cos_m1, cos_m)
+            cos_m1 = dr.select(new_m, cos_m, cos_m1)
+            value = dr.select(is_diagonal > 0.0, diagonal, a * (mu * last - b * before))
+            before = dr.select(is_diagonal > 0.0, 0.0, last)
+            basis = value * next_cos
+            corner = [packet(self.moments, node * stride + i, size, active) for node in nodes]
+            moment = [_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis for c in range(channels)]
+            degree = t.UInt(dr.gather(t.Float, self._l, i, active))
+            chi = packet(self._chi, degree, kinds * size, active)
+            sums = [dr.fma(chi[n], moment[n % size], sums[n]) if n % size < channels else sums[n] for n in range(kinds * size)]
+            return i + 1, diagonal, value, before, next_cos, cos_m1, sums
+
+        width = dr.width(h)
+        zero, one = dr.zeros(t.Float, width), dr.full(t.Float, 1.0, width)
+        # cos(0 phi) = 1, and cos(-1 phi) = cos phi starts the recurrence cos((m + 1) phi) = 2 cos phi cos(m phi) - cos((m - 1) phi).
+        state = (t.UInt(0), one * 0.28209479, zero, zero, one, cos_phi + zero, [dr.zeros(t.Float, width) for _ in range(kinds * size)])
+        *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
+        return [[dr.maximum(sums[n * size + c], 0.0) for c in range(channels)] for n in range(kinds)]
+
+
+def _blend(weights: list[Any], values: list[Any]) -> Any:
+    total = weights[0] * values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        total = dr.fma(weight, value, total)
+    return total
+
+
+def _geometric(a: Any, b: Any, f: Any) -> Any:
+    """a^(1-f) b^f; linear where one of them is hardly there (at the top nothing arrives from above)."""
+    near = dr.minimum(a, b) > 1e-3 * dr.maximum(a, b)
+    ratio = dr.select(near, b / dr.select(near, a, 1.0), 1.0)
+    return dr.select(near, a * dr.exp(f * dr.log(ratio)), dr.lerp(a, b, f))
+
+
+def _interleave(chi: list[list[Any]], degree: int) -> Any:
+    """Moments chi[kind][channel] (buffers over l) as one buffer [l, kind, padded channel]."""
+    t = types()
+    kinds = len(chi)
+    size = padded(len(chi[0])) if kinds else 1
+    out = dr.zeros(t.Float, max((degree + 1) * kinds * size, 1))
+    l_ = dr.arange(t.UInt, degree + 1)
+    for n, per_channel in enumerate(chi):
+        for c, moments in enumerate(per_channel):
+            dr.scatter(out, moments, (l_ * kinds + n) * size + c)
+    return out

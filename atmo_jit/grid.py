@@ -1,0 +1,140 @@
+"""The nodes on which the radiance field is solved: altitudes and sun zenith angles, placed where a given atmosphere needs them.
+
+Altitude nodes are uniform in a coordinate u(h) that grows with the scattering matter passed, flattened so that the thin upper air gets its
+share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta), dense around the twilight.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .atmosphere import Atmosphere
+from .backend import floats, parameter, types
+from .plan import Resolution
+
+_FINE = 2048
+_TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
+
+
+class Grid:
+    """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
+
+    The field is solved at K altitudes and S suns, and interpolated, cubically, to the refined ``levels`` and ``sources`` suns, on which
+    light is then looked up linearly.
+    """
+
+    def __init__(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
+        self.radius_m = atmosphere.bottom_radius_m
+        self.thickness_m = atmosphere.thickness_m
+        self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine[0])
+        self._place_suns(resolution.suns, resolution.refine[1])
+
+    def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
+        # Samples quadratic in altitude, so that a thin layer at the ground is resolved too.
+        h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 3
+        rise = 0.12 * np.diff(h) / atmosphere.thickness_m
+        for c in atmosphere.constituents:
+            if c.phase is None or not np.any(c.scattering_per_m > 0):
+                continue
+            density = np.maximum(np.asarray(c.profile.density(0.5 * (h[1:] + h[:-1]))), 0.0)
+            step = density ** (1.0 / 3.0) * np.diff(h)
+            if step.sum() > 0:
+                rise = rise + step / step.sum()
+        u = np.concatenate([[0.0], np.cumsum(rise)])
+        u *= refine * (count - 1) / u[-1]
+        self.levels = np.interp(np.arange(refine * (count - 1) + 1), u, h)
+        self.levels[0], self.levels[-1] = 0.0, atmosphere.thickness_m
+        self.h = self.levels[::refine]
+        self._u = u
+        self.altitude_refinement = _cubic_refinement(count, refine, even=False)
+
+    def _place_suns(self, count: int, refine: int) -> None:
+        # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for multiple.
+        dip = np.arccos(self.radius_m / (self.radius_m + self.thickness_m))
+        end = min(0.5 * np.pi + 2.2 * dip, np.pi)
+        self._center, self._width = 0.5 * np.pi + 0.3 * dip, 0.8 * dip
+        theta = np.linspace(0.0, end, 4 * _FINE)
+        self._scale = 1.0
+        fine = refine * (count - 1)
+        self._scale = fine / self._sun_coordinate(end)
+        self.sources = fine + 1  # refined suns
+        self.theta = np.interp(np.linspace(0.0, fine, count), self._sun_coordinate(theta), theta)
+        self.sun_refinement = _cubic_refinement(count, refine, even=True)
+
+    def _sun_coordinate(self, theta: np.ndarray | float) -> np.ndarray:
+        bend = np.arctan((theta - self._center) / self._width) + np.arctan(self._center / self._width)
+        return self._scale * (theta + _TWILIGHT * self._width * bend)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(K, S): numbers of altitude and sun nodes solved for."""
+        return len(self.h), len(self.theta)
+
+    def u_of(self, h: np.ndarray) -> np.ndarray:
+        """Altitude coordinate, j at refined level j (float64)."""
+        return np.interp(self._position(np.asarray(h)), np.arange(_FINE + 1), self._u)
+
+    def _position(self, h: np.ndarray) -> np.ndarray:
+        return np.cbrt(np.clip(h / self.thickness_m, 0.0, 1.0)) * _FINE
+
+    @cached_property
+    def _u_buffer(self) -> Any:
+        return floats(self._u)
+
+    def locate_altitude(self, h: Any) -> tuple[Any, Any]:
+        """Index of the refined level below altitude ``h`` and the fraction of the way to the next."""
+        t = types()
+        position = dr.cbrt(dr.clip(h / parameter(self.thickness_m), 0.0, 1.0)) * _FINE
+        cell = dr.minimum(t.UInt(position), _FINE - 1)
+        u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
+        return _split(dr.lerp(u0, u1, position - t.Float(cell)), len(self.levels))
+
+    def sun_position(self, mu_s: Any) -> Any:
+        """Sun coordinate x of cos(sun zenith) ``mu_s``, in units of the refined nodes, clipped to the last."""
+        center, width, scale = (parameter(v) for v in (self._center, self._width, self._scale))
+        theta = dr.acos(mu_s)
+        bend = dr.atan((theta - center) / width) + dr.atan(center / width)
+        return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta), 0.0, self.sources - 1.0)
+
+    def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
+        """Index of the refined sun node before ``mu_s`` and the fraction of the way to the next."""
+        return _split(self.sun_position(mu_s), self.sources)
+
+
+def _split(position: Any, count: int) -> tuple[Any, Any]:
+    t = types()
+    index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), count - 2)
+    return index, position - t.Float(index)
+
+
+def _cubic_refinement(count: int, refine: int, *, even: bool) -> np.ndarray:
+    """Matrix [refine (count - 1) + 1, count]: Catmull-Rom interpolation of equidistant values at ``refine`` points per interval.
+
+    ``even``: the function is even about its first node; other ends go straight on.
+    """
+    matrix = np.zeros((refine * (count - 1) + 1, count))
+    for row in range(len(matrix)):
+        cell = min(row // refine, count - 2)
+        f = row / refine - cell
+        weights = (
+            -0.5 * f + f**2 - 0.5 * f**3,
+            1.0 - 2.5 * f**2 + 1.5 * f**3,
+            0.5 * f + 2.0 * f**2 - 1.5 * f**3,
+            -0.5 * f**2 + 0.5 * f**3,
+        )
+        for place, weight in enumerate(weights, cell - 1):
+            if place < 0 and even:
+                matrix[row, -place] += weight
+            elif place < 0:
+                matrix[row, 0] += 2.0 * weight
+                matrix[row, 1] -= weight
+            elif place >= count:
+                matrix[row, count - 1] += 2.0 * weight
+                matrix[row, count - 2] -= weight
+            else:
+                matrix[row, place] += weight
+    return matrix

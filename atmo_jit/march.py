@@ -1,0 +1,272 @@
+"""Marching along view rays: exact single scattering, the gather of multiple scattering, columns and transmittance in one pass.
+
+A ray is cut where something happens: at the altitudes where a profile has a kink or has changed by some e-folds, at its perigee, where
+it enters or leaves the planet's shadow, and wherever a channel's optical depth has grown by MAX_DEPTH. Inside a piece everything is smooth
+and four Gauss-Legendre nodes suffice, in clear air and in fog alike. Every ray stops as soon as its transmittance is spent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+
+from .backend import floats, packet, parameter, types
+from .column import SunColumns
+from .geometry import altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
+from .optics import Optics
+from .quadrature import gauss_legendre, running_integral
+
+NODES = 4  # per piece
+FEW = 4  # per piece, for densities and columns, which are smooth
+MAX_DEPTH = 1.0  # optical depth of a piece: exp(-tau) over it is a polynomial of degree 7 to 1e-7
+SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
+
+
+@dataclass
+class Rays:
+    """Rays that start inside the atmosphere, with the sun's place; every member a Float or Bool array of one width.
+
+    ``h`` altitude (m) of the origin; ``mu``, ``mu_s``, ``nu``: cosines of view zenith, sun zenith (at the origin) and their angle;
+    ``stop`` distance (m) to the end; ``ground``: the ray ends on the ground.
+    """
+
+    h: Any
+    mu: Any
+    mu_s: Any
+    nu: Any
+    stop: Any
+    ground: Any
+
+
+@dataclass
+class Light:
+    """What a march returns, per channel: ``single`` and ``multiple`` scattered radiance and the ``transmittance`` to the end."""
+
+    single: list[Any]
+    multiple: list[Any]
+    transmittance: list[Any]
+
+
+class Source(Protocol):
+    """A field of scattered radiance that scatters again."""
+
+    def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
+        """Integral of phase function times radiance over all directions, toward (mu, phi): [scatterer][channel]."""
+
+
+def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
+    """Rays from ``h`` to whatever they meet first, the ground or the top."""
+    ground = hits_ground(optics.radius, h, mu)
+    stop = dr.select(ground, distance_down(optics.radius, h, mu, 0.0), distance_up(optics.radius, h, mu, optics.thickness))
+    return Rays(h, mu, mu_s, nu, stop, ground)
+
+
+def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
+    """Fraction of the solar disc above the horizon of a point at altitude ``h``: a smooth step over the disc's angular diameter.
+
+    Bruneton 2017, GetTransmittanceToSun; a point sun (radius 0) is cut sharply.
+    """
+    horizon_sine = optics.radius / r
+    horizon_mu = -dr.sqrt(h * (2.0 * optics.radius + h)) / r
+    half_width = dr.maximum(horizon_sine * optics.sun_radius, 1e-7)
+    x = dr.clip(0.5 + 0.5 * (mu_s - horizon_mu) / half_width, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def point_along(optics: Optics, rays: Rays, distance: Any) -> tuple[Any, Any, Any]:
+    """Altitude, radius and sun cosine of the point at ``distance`` along each ray."""
+    h, r = altitude_along(optics.radius, rays.h, rays.mu, distance)
+    mu_s = dr.clip(dr.fma(distance, rays.nu, (optics.radius + rays.h) * rays.mu_s) / r, -1.0, 1.0)
+    return h, r, mu_s
+
+
+def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
+    """Distances along the ray where sunlight does not change smoothly; beyond ``stop`` where there is none.
+
+    The perigee of the sunbeam through a point lies at altitude k where h (2R + h) - (r mu_s)^2 = k (2R + k): along a ray a
+    quadratic in the distance, the cylinder of radius R + k about the axis through sun and planet. k = 0 is the planet's shadow; at
+    the kinks of a profile the column toward the sun has a square-root edge. Only the far side of the planet (mu_s < 0) counts.
+    """
+    radius, r = optics.radius, optics.radius + rays.h
+    a = (1.0 - rays.nu) * (1.0 + rays.nu)
+    b = r * (rays.mu - rays.mu_s * rays.nu)
+    axial = r * rays.mu_s
+    never = 2.0 * rays.stop + 1.0
+    edges = []
+    for k in [parameter(level) for level in optics.edge_levels_m]:
+        c = (rays.h - k) * (2.0 * radius + rays.h + k) - axial * axial
+        discriminant = dr.fma(b, b, -a * c)
+        q = -b - dr.copysign(dr.safe_sqrt(discriminant), b)
+        for distance in (c / q, q / a):
+            counts = (discriminant > 0.0) & dr.isfinite(distance) & (distance > 0.0) & (dr.fma(distance, rays.nu, axial) < 0.0)
+            edges.append(dr.select(counts, distance, never))
+    return edges
+
+
+class Rule:
+    """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW coarser nodes.
+
+    The node count is a parameter: another one needs no other kernel.
+    """
+
+    def __init__(self, nodes: int) -> None:
+        t = types()
+        x, w = gauss_legendre(nodes)
+        few_x, few_w = gauss_legendre(FEW)
+        self.few_x, self.few_w = few_x.tolist(), few_w.tolist()
+        rows = np.column_stack([x, w, running_integral(FEW, tuple(x)), np.zeros((nodes, 8 - 2 - FEW))])
+        self._rows = floats(rows)
+        self.count = dr.opaque(t.UInt, nodes, 1)
+
+    def at(self, g: Any) -> list[Any]:
+        """Node x, weight w, and the FEW coefficients of the column up to x."""
+        return packet(self._rows, g, 8)[: 2 + FEW]
+
+    def sum(self, coefficients: list[Any], density: list[list[Any]], constituent: int) -> Any:
+        """Sum over the few nodes of coefficient times density."""
+        total = coefficients[0] * density[0][constituent]
+        for coefficient, values in zip(coefficients[1:], density[1:], strict=True):
+            total = dr.fma(coefficient, values[constituent], total)
+        return total
+
+
+def march(
+    optics: Optics, columns: SunColumns, rays: Rays, *, nodes: int = NODES, single: bool = True, source: Source | None = None
+) -> Light:
+    """Radiance scattered toward the origin of each ray, per unit of ``optics.solar``; ground light is not included.
+
+    Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's shadow.
+    ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the centroid of the
+    piece's weight, which is exact for a field that is linear there.
+    """
+    t = types()
+    c_count, k_count = optics.channel_count, len(optics.constituents)
+    width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
+    if k_count == 0:
+        zero = [dr.zeros(t.Float, width) for _ in range(c_count)]
+        return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(c_count)])
+    breaks = t.Float(optics.breaks_m.astype(np.float32))
+    last = parameter(len(optics.breaks_m) - 2.0)
+    densest = _largest_extinctions(optics, breaks)
+    perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
+    r_mu = (optics.radius + rays.h) * rays.mu
+    edges = _sunlight_edges(optics, rays) if single else []
+    rule = Rule(nodes)
+    phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
+
+    def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
+        falling = r_mu + d < 0.0
+        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
+        bottoms_out = falling & (target <= perigee)
+        crossing = dr.select(
+            bottoms_out,
+            -r_mu,
+            dr.select(
+                falling,
+                distance_down(optics.radius, rays.h, rays.mu, target),
+                distance_up(optics.radius, rays.h, rays.mu, target),
+            ),
+        )
+        limit = d + MAX_DEPTH / dr.maximum(dr.gather(t.Float, densest, t.UInt(shell)), 1e-30)
+        end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
+        for edge in edges:
+            end = dr.select(edge > d, dr.minimum(end, edge), end)
+        length = end - d
+
+        density = [optics.densities(altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, x, d))[0]) for x in rule.few_x]
+
+        def node(g: Any, one: list[Any], weight: list[Any], centroid: Any, total: Any) -> tuple[Any, ...]:
+            x, w, *running = rule.at(g)
+            h, r, mu_s = point_along(optics, rays, dr.fma(length, x, d))
+            inside = [dr.fma(length, rule.sum(running, density, k), amounts[k]) for k in range(k_count)]
+            seen = [dr.exp(-depth) * (length * w) for depth in optics.optical_depths(inside)]
+            here = optics.densities(h)
+            if single:
+                sun_depths = optics.optical_depths(columns.toward(h, mu_s))
+                fraction = visible_sun(optics, h, r, mu_s)
+                lit = [s * dr.exp(-depth) * fraction for s, depth in zip(seen, sun_depths, strict=True)]
+                for k in optics.scatterers:
+                    for c in range(c_count):
+                        one[c] = dr.fma(optics.scattering[k][c] * phases[k][c] * here[k], lit[c], one[c])
+            if source is not None:
+                for n, k in enumerate(optics.scatterers):
+                    for c in range(c_count):
+                        share = optics.scattering[k][c] * here[k] * seen[c]
+                        weight[n * c_count + c] += share
+                        total = total + share
+                        centroid = dr.fma(share, x, centroid)
+            return g + 1, one, weight, centroid, total
+
+        zero = d * 0.0
+        weight = [zero + 0.0 for _ in range(len(optics.scatterers) * c_count if source is not None else 0)]
+        state = (t.UInt(0), one, weight, zero + 0.0, zero + 0.0)
+        _, one, weight, centroid, total = dr.while_loop(state, lambda g, *_: g < rule.count, node, label="nodes")
+        if source is not None:
+            at = dr.fma(length, dr.select(total > 0.0, centroid / total, 0.5), d)
+            h, r, mu_s = point_along(optics, rays, at)
+            mu = dr.clip((r_mu + at) / r, -1.0, 1.0)
+            toward = source.scattered(h, mu_s, mu, relative_azimuth(mu, mu_s, rays.nu), total > 0.0)
+            for n in range(len(optics.scatterers)):
+                for c in range(c_count):
+                    more[c] = dr.fma(weight[n * c_count + c], toward[n][c], more[c])
+
+        for k in range(k_count):
+            amounts[k] = dr.fma(length, rule.sum(rule.few_w, density, k), amounts[k])
+        crossed = end >= crossing
+        shell = dr.select(crossed & ~bottoms_out, dr.clip(shell + dr.select(falling, -1.0, 1.0), 0.0, last), shell)
+        return end, shell, amounts, one, more
+
+    def unfinished(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> Any:
+        depths = optics.optical_depths(amounts)
+        thinnest = depths[0]
+        for depth in depths[1:]:
+            thinnest = dr.minimum(thinnest, depth)
+        return (d < rays.stop) & (thinnest < SPENT_DEPTH)
+
+    state = (
+        dr.zeros(t.Float, width),
+        _first_shell(optics, rays, breaks, last),
+        [dr.zeros(t.Float, width) for _ in range(k_count)],
+        [dr.zeros(t.Float, width) for _ in range(c_count)],
+        [dr.zeros(t.Float, width) for _ in range(c_count)],
+    )
+    _, _, amounts, one, more = dr.while_loop(state, unfinished, piece, label="march")
+    return Light(
+        [radiance * solar for radiance, solar in zip(one, optics.solar, strict=True)],
+        more,
+        [dr.exp(-depth) for depth in optics.optical_depths(amounts)],
+    )
+
+
+def relative_azimuth(mu: Any, mu_s: Any, nu: Any) -> Any:
+    """cos of the azimuth between view and sun at a point: (nu - mu mu_s) / (sin sin_s); 1 where either is vertical."""
+    sines = safe_sine(mu) * safe_sine(mu_s)
+    return dr.select(sines > 0.0, dr.clip((nu - mu * mu_s) / sines, -1.0, 1.0), 1.0)
+
+
+def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
+    """Index (as a Float) of the shell [b_j, b_{j+1}] that the ray enters first: the lower one where it starts on a break and falls."""
+    t = types()
+    count = len(optics.breaks_m)
+    falling = rays.mu < 0.0
+
+    def below(i: Any) -> Any:
+        level = dr.gather(t.Float, breaks, i)
+        return (level < rays.h) | (~falling & (level <= rays.h))
+
+    index = dr.binary_search(0, count - 1, below)
+    return dr.clip(t.Float(index) - 1.0, 0.0, last)
+
+
+def _largest_extinctions(optics: Optics, breaks: Any) -> Any:
+    """Largest extinction coefficient (1/m) of each shell: profiles are monotone between breaks, so it is at one of its ends."""
+    t = types()
+    count = len(optics.breaks_m)
+    at_breaks = optics.largest_extinction(optics.densities(breaks))
+    # A step in a tabulated profile sits on a break, and the density there is the upper side's.
+    under = optics.largest_extinction(optics.densities(breaks * (1.0 - 1e-6)))
+    lower = dr.arange(t.UInt, count - 1)
+    return dr.maximum(dr.gather(t.Float, at_breaks, lower), dr.gather(t.Float, under, lower + 1))

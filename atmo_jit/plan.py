@@ -1,0 +1,82 @@
+"""What an atmosphere and a tolerance need: how many nodes, directions, moments and orders a solve is given.
+
+The rules are measured, not derived: `python -m bench.accuracy` prints what they reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .atmosphere import Atmosphere, Constituent
+
+DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Numbers of nodes, directions and moments of a solve.
+
+    ``altitudes``, ``suns``: nodes solved for; ``refine``: parts into which cubic interpolation divides every interval of either.
+    ``up``, ``down``, ``azimuths``: directions at a node for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for
+    order 1, whose forward peak is sharper. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
+    sun-column table (altitudes, cosines).
+    """
+
+    altitudes: int = 12
+    suns: int = 31
+    refine: tuple[int, int] = (2, 3)
+    up: int = 6
+    down: int = 4
+    azimuths: int = 8
+    degree: int = 4
+    first_up: int = 10
+    first_down: int = 8
+    first_azimuths: int = 14
+    first_degree: int = 12
+    orders: int = 20
+    columns: tuple[int, int] = (96, 128)
+
+    @classmethod
+    def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
+        """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
+
+        Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those particles scatter.
+        """
+        first = _degree(atmosphere, power=2.0, target=0.1 * tolerance)
+        later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
+        fine = tolerance < 0.005
+        return cls(
+            altitudes=16 if fine else 12,
+            up=max(6, later // 2 + 4),
+            down=max(4, later // 3 + 3),
+            azimuths=max(later, first // 2) + 2,
+            degree=later,
+            first_up=max(10, first // 2 + 4),
+            first_down=max(8, first // 2 + 2),
+            first_azimuths=first + 4,
+            first_degree=first,
+        )
+
+
+def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
+    """Smallest offered degree beyond which share * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every scatterer."""
+    needed = 2
+    for constituent in atmosphere.constituents:
+        if constituent.phase is None:
+            continue
+        share = -np.expm1(-3.0 * _scattering_depth(atmosphere, constituent))
+        for wavelength in range(len(atmosphere.wavelengths_nm)):
+            chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
+            term = share[wavelength] * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
+            above = np.nonzero(term > target)[0]
+            needed = max(needed, int(above[-1]) if len(above) else 0)
+    return next((degree for degree in DEGREES if degree >= needed), DEGREES[-1])
+
+
+def _scattering_depth(atmosphere: Atmosphere, constituent: Constituent) -> np.ndarray:
+    """Vertical scattering optical depth [W] of a constituent."""
+    h = atmosphere.thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
+    column = np.trapezoid(np.asarray(constituent.profile.density(h)), h)
+    return constituent.scattering_per_m * column

@@ -1,0 +1,1 @@
+"""Fits of atmospheres to measured skies."""

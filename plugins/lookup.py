@@ -1,0 +1,158 @@
+"""The panorama in the types of a Mitsuba variant: look-up and importance sampling of sky and sun.
+
+Textures serve as arrays here because they are the one kind of table that scalar and vectorised variants read alike. Everything
+works in the emitter's local frame (Z up) and in the current variant.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, Disc, Panorama, Warp, mean_of_corners
+
+ROWS = ROWS_DOWN + ROWS_UP
+# Importance of a cell: luminance times this. Surfaces that see the zenith see it at a better angle than the horizon; those that see the ground
+# find it by sampling their BSDF, since it has no small bright features.
+HORIZON_IMPORTANCE = 0.5
+GROUND_SHARE = 0.02
+# Share of the sky's samples that is spread evenly, so that no direction has density 0 (night, black sky seen from space).
+EVEN_SHARE = 0.005
+
+
+def number(x: float) -> Any:
+    """``x`` in the variant's type, read from memory so that kernels do not depend on its value."""
+    return dr.opaque(mi.Float, float(x)) if dr.is_jit_v(mi.Float) else float(x)
+
+
+def texture(values: Any, *, nearest: bool = False) -> Any:
+    """A texture with the given texels [..., channels]: a NumPy array, or a TensorXf, whose gradient it keeps."""
+    tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+    kind = {1: mi.Texture1f, 2: mi.Texture2f, 3: mi.Texture3f}[len(tensor.shape) - 1]
+    mode = dr.FilterMode.Nearest if nearest else dr.FilterMode.Linear
+    return kind(tensor, use_accel=False, migrate=False, filter_mode=mode, wrap_mode=dr.WrapMode.Clamp)
+
+
+class WarpLookup:
+    """A :class:`Warp` with up to two centres in the variant's types."""
+
+    def __init__(self, warp: Warp) -> None:
+        pairs = list(zip(warp.centres, warp.sharpness, warp.gains, strict=True))
+        self.linear = number(warp.linear)
+        self.terms = [(number(s), number(c * s), number(g)) for c, s, g in pairs]
+        self.offset = number(sum(g * math.asinh(c * s) for c, s, g in pairs))
+
+    def __call__(self, x: Any) -> Any:
+        u = dr.fma(self.linear, x, self.offset)
+        for sharpness, shift, gain in self.terms:
+            u = dr.fma(gain, dr.asinh(dr.fma(x, sharpness, -shift)), u)
+        return dr.clip(u, 0.0, 1.0)
+
+
+class SkyLookup:
+    """Coordinates of a direction in the table, and sampling of directions in proportion to radiance.
+
+    ``luminance`` [rows, columns]: of the table's nodes, float64, any unit.
+    """
+
+    def __init__(self, view: Panorama, luminance: np.ndarray) -> None:
+        self.dip = number(view.dip)
+        self.up, self.down, self.around = WarpLookup(view.up), WarpLookup(view.down), WarpLookup(view.around)
+        sines, azimuths = view.cells()
+        self.sines = texture(sines[:, None])
+        self.azimuths = texture(azimuths[:, None])
+        solid = view.solid_angles()
+        weight, self.flux = importance(view, luminance)
+        total = weight.sum()
+        probability = weight / total if total > 0.0 else np.zeros_like(weight)
+        even = EVEN_SHARE if total > 0.0 else 1.0
+        probability = (1.0 - even) * probability + even * solid / solid.sum()
+        self.distribution = mi.DiscreteDistribution2D(np.ascontiguousarray(probability, dtype=np.float32))
+        self.density = texture((probability / solid)[..., None], nearest=True)
+
+    def elevation(self, z: Any, across: Any) -> Any:
+        """Elevation above the horizon (rad) of a direction with height ``z`` and horizontal length ``across``."""
+        return dr.atan2(z, across) + self.dip
+
+    def place(self, a: Any, phi: Any) -> tuple[Any, Any, Any]:
+        """Columns, row below the horizon and row above it, each as a fraction in [0, 1] counted from the sun or from the horizon."""
+        height = dr.abs(a)
+        return self.around(phi), self.down(height), self.up(height)
+
+    def node(self, a: Any, place: tuple[Any, Any, Any]) -> Any:
+        """Texture coordinates (column, row) for interpolation between nodes."""
+        u, down, up = place
+        row = dr.select(a >= 0.0, dr.fma(up, ROWS_UP, ROWS_DOWN + 1.5), dr.fma(down, -ROWS_DOWN, ROWS_DOWN + 0.5))
+        return mi.Point2f(dr.fma(u, COLUMNS, 0.5) / (COLUMNS + 1), row / (ROWS + 2))
+
+    def pdf(self, a: Any, place: tuple[Any, Any, Any], active: Any) -> Any:
+        """Density per solid angle (1/sr) of :meth:`sample`."""
+        u, down, up = place
+        row = dr.select(
+            a >= 0.0,
+            dr.minimum(dr.fma(up, ROWS_UP, ROWS_DOWN), ROWS - 0.01),
+            dr.clip(dr.fma(down, -ROWS_DOWN, ROWS_DOWN), 0.0, ROWS_DOWN - 0.01),
+        )
+        column = dr.minimum(u * COLUMNS, COLUMNS - 0.01)
+        return self.density.eval(mi.Point2f(column / COLUMNS, row / ROWS), active)[0]
+
+    def sample(self, sample: Any, active: Any) -> tuple[Any, Any]:
+        """Sine of the elevation above the horizontal, and azimuth from the sun in [-pi, pi]: even within a cell."""
+        cell, _, rest = self.distribution.sample(sample, active)
+        left = rest.x < 0.5
+        along = dr.select(left, 2.0 * rest.x, dr.fma(2.0, rest.x, -1.0))
+        column = (mi.Float(cell.x) + along + 0.5) / (COLUMNS + 1)
+        # The rows at the horizon stand twice among the nodes: cells above it begin one node later.
+        row = mi.Float(cell.y) + rest.y + dr.select(cell.y >= ROWS_DOWN, 1.5, 0.5)
+        phi = self.azimuths.eval(column, active)[0]
+        return self.sines.eval(row / (ROWS + 2), active)[0], dr.select(left, phi, -phi)
+
+
+def importance(view: Panorama, luminance: np.ndarray) -> tuple[np.ndarray, float]:
+    """Sampling weights of the cells, and what the sky gives a surface that competes with the sun (see :func:`sun_share`)."""
+    flux = mean_of_corners(np.maximum(luminance, 0.0)) * view.solid_angles()
+    sines = np.delete(0.5 * (view.cells()[0][1:] + view.cells()[0][:-1]), ROWS_DOWN)[:, None]
+    weight = flux * (HORIZON_IMPORTANCE + (1.0 - HORIZON_IMPORTANCE) * np.clip(sines, 0.0, 1.0))
+    above, below = weight[ROWS_DOWN:].sum(), weight[:ROWS_DOWN].sum()
+    if above > 0.0 and below > GROUND_SHARE * above:
+        weight[:ROWS_DOWN] *= GROUND_SHARE * above / below
+    return weight, float(weight.sum())
+
+
+class SunLookup:
+    """The disc in the variant's types: is a direction inside, where in the table, and even sampling of it."""
+
+    def __init__(self, disc: Disc) -> None:
+        self.low = number(disc.low)
+        self.scale = number(1.0 / max(disc.high - disc.low, 1e-9))
+        self.risen = number(1.0 if disc.high > disc.low else 0.0)
+        self.half_chord = number(math.sin(0.5 * disc.radius))
+        self.inverse_chord2 = number(1.0 / (2.0 * math.sin(0.5 * disc.radius)) ** 2)
+        self.density = number(1.0 / disc.solid_angle)
+
+    def distance2(self, d: Any, sun: Any) -> Any:
+        """Squared distance of ``d`` from the centre, 1 at the limb: from the chord, since 1 - cos would be lost in single precision."""
+        return dr.squared_norm(d - sun) * self.inverse_chord2
+
+    def node(self, a: Any, distance2: Any) -> tuple[Any, Any]:
+        """Texture coordinates (distance, elevation) between the first and the last texel's centre."""
+        from .panorama import SUN_COLUMNS, SUN_ROWS
+
+        x, y = dr.clip(distance2, 0.0, 1.0), dr.clip((a - self.low) * self.scale, 0.0, 1.0)
+        return dr.fma(x, SUN_COLUMNS - 1, 0.5) / SUN_COLUMNS, dr.fma(y, SUN_ROWS - 1, 0.5) / SUN_ROWS
+
+    def sample(self, sample: Any, sun: Any) -> Any:
+        """A direction within the disc, even in solid angle."""
+        s = self.half_chord * dr.sqrt(sample.x)  # sine of half the angle from the centre
+        sine = 2.0 * s * dr.sqrt(dr.fma(-s, s, 1.0))
+        sin_phi, cos_phi = dr.sincos(2.0 * dr.pi * sample.y)
+        return mi.Frame3f(sun).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, dr.fma(-2.0 * s, s, 1.0)))
+
+
+def sun_share(sun: float, sky: float) -> float:
+    """Probability of sampling the sun, given the luminous flux of sun and sky; 0 without a sun."""
+    return sun / (sun + sky) if sun > 0.0 else 0.0

@@ -1,0 +1,18 @@
+"""Plugin classes for every variant from one description."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+
+def bound(description: type, base: str) -> type:
+    """A subclass of ``mi.<base>`` of the current variant with the attributes of ``description``.
+
+    Mitsuba's classes allow no second base class, so the attributes are copied. ``description`` calls inherited methods as
+    ``mi.<base>.method(self, ...)``.
+    """
+    skipped = ("__dict__", "__weakref__")
+    attributes: dict[str, Any] = {k: v for k, v in vars(description).items() if k not in skipped}
+    return type(getattr(mi, base))(description.__name__, (getattr(mi, base),), attributes)
