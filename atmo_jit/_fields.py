@@ -60,7 +60,7 @@ def numbers(value: Any, name: str, allowed: Range = ANY, *, least: int = 1) -> n
     if not _is_list(value) or len(value) < least:
         found = f"a list of {len(value)}" if _is_list(value) else shown(value)
         raise AtmosphereError(name, found, f"a list of at least {least} finite number{'s' * (least > 1)}{allowed}")
-    return np.array([number(x, f"{name}[{i}]", allowed) for i, x in enumerate(value)], dtype=np.float64)
+    return np.fromiter((_element(x, name, i, allowed) for i, x in enumerate(value)), np.float64, len(value))
 
 
 def per_wavelength(value: Any, name: str, count: int, allowed: Range = ANY) -> np.ndarray:
@@ -106,6 +106,13 @@ def one_of(value: Mapping[str, Any], *groups: Sequence[str]) -> Sequence[str]:
         if key not in value:
             raise AtmosphereError(key, MISSING, f"exactly one of {choice}")
     return present[0]
+
+
+def _element(value: Any, name: str, index: int, allowed: Range) -> float:
+    # The common case, without making a name for a message that is not needed.
+    if (type(value) is float or (type(value) is int and abs(value) < 2**53)) and value in allowed:
+        return value
+    return number(value, f"{name}[{index}]", allowed)
 
 
 def _is_list(value: Any) -> bool:

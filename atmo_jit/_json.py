@@ -71,5 +71,5 @@ def plain(value: Any, name: str = "") -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (list, tuple)):
-        return [plain(item, f"{prefix}{i}") for i, item in enumerate(value)]
+        return [item if type(item) in (int, float) else plain(item, f"{prefix}{i}") for i, item in enumerate(value)]
     return value

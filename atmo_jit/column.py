@@ -1,11 +1,15 @@
-"""Column densities (m) of every constituent from any point to the sun: one small table per planet profile.
+"""Column densities (m) of every constituent from any point to the sun: one small table per atmosphere's profiles.
 
 Columns, not transmittance, are stored: exp(-sum beta_k N_k) neither underflows nor divides 0 by 0 in haze, and coefficients,
 wavelengths and ozone amount drop out of the table.
 
 Only rays that rise (mu >= 0) are tabulated. A ray that descends passes its perigee at altitude h_p and rises again, so that
 N(h, -mu) = 2 N(h_p, 0) - N(h, mu). What is stored is the mean density along the path to the top, N / d_top: finite and smooth
-up to the top, where both vanish, and constant in mu for a flat layer. Exponential profiles are stored as its logarithm, linear in h.
+up to the top, where both vanish, and constant in mu for a flat layer.
+
+Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends. Just below a kink
+a horizontal ray's column has a root, sqrt(h_break - h): rows lie at h_break - width x^2, and profiles with kinks are interpolated
+linearly in x, which is exact for the root. Exponential profiles have no kinks; the logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations
@@ -15,54 +19,58 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import packet, parameter, types
+from .backend import floats, packet, parameter, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .optics import Optics
 from .profile import Exponential
 from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
+_CELLS = 4096  # of the look-up from altitude to shell, uniform in the cube root of altitude
 
 
 class SunColumns:
-    """Table of mean densities over altitude (uniform) and mu in [0, 1] (logarithmic from the horizontal); bilinear.
+    """Table of mean densities over altitude and mu in [0, 1] (logarithmic from the horizontal); bilinear.
 
-    ``size`` = (altitudes, cosines). The cosine nodes are mu = c (e^{s x} - 1), fine where the thinnest layer's path length
-    turns from 1/mu to horizontal, mu about sqrt(2 H / R).
+    ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} - 1), fine where the
+    thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
     """
 
     def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128)) -> None:
         self.optics = optics
-        self.size = size
+        self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
-        atmosphere = optics.atmosphere
+        atmosphere, breaks = optics.atmosphere, optics.breaks_m
         heights = [c.profile.scale_height_m for c in optics.constituents if isinstance(c.profile, Exponential)]
         thinnest = min([atmosphere.thickness_m, *heights])
         knee = 0.7 * np.sqrt(2.0 * thinnest / atmosphere.bottom_radius_m)
-        self._knee = parameter(knee)
-        self._log_range = parameter(np.log1p(1.0 / knee))
-        self._count = len(optics.constituents)
+        self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
+        self._shells, self._cosines = len(breaks) - 1, size[1]
+        self._rows = max(4, round(size[0] / self._shells))  # intervals per shell
+        edges = np.cbrt(breaks / atmosphere.thickness_m) * _CELLS
+        cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
+        self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
+        self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
+        self._per_metre = parameter(1.0 / atmosphere.thickness_m)
         if self._count:
             self._table = self._build()
 
     def _build(self) -> Any:
         t = types()
-        n_h, n_mu = self.size
-        lane = dr.arange(t.UInt, n_h * n_mu)
-        row, column = lane // n_mu, lane % n_mu
-        top = self.optics.thickness
-        # The last row would be 0 / 0: a hair below the top the mean density is the density there.
-        h = dr.minimum(t.Float(row) / (n_h - 1), 1.0 - 1e-4) * top
-        x = t.Float(column) / (n_mu - 1)
-        mu = self._knee * (dr.exp(x * self._log_range) - 1.0)
-        totals = column_up(self.optics, h, dr.minimum(mu, 1.0))
-        path = distance_up(self.optics.radius, h, dr.minimum(mu, 1.0), top)
-        table = dr.zeros(t.Float, n_h * n_mu * self._count)
+        rows, cosines = self._rows + 1, self._cosines
+        lane = dr.arange(t.UInt, self._shells * rows * cosines)
+        row, column = lane // cosines % rows, lane % cosines
+        low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
+        x = t.Float(row) / self._rows
+        # Each end belongs to this shell's side of the break; at the top itself the mean would be 0 / 0.
+        h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
+        mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
+        totals = column_up(self.optics, h, mu)
+        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
+        table = dr.zeros(t.Float, dr.width(lane) * self._count)
         for k, total in enumerate(totals):
             mean = total / path
-            if self._logarithmic[k]:
-                mean = dr.log(dr.maximum(mean, 1e-37))
-            dr.scatter(table, mean, lane * self._count + k)
+            dr.scatter(table, dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean, lane * self._count + k)
         return table
 
     def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
@@ -75,25 +83,34 @@ class SunColumns:
         mu = dr.maximum(mu, -dr.sqrt(h * (2.0 * radius + h)) / (radius + h))
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
-        lowest = dr.maximum(perigee_altitude(self.optics.radius, h, mu), 0.0)
+        lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
         whole = self._rising(lowest, types().Float(0.0), sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
         t = types()
-        n_h, n_mu = self.size
-        top = self.optics.thickness
-        y = dr.clip(h / top, 0.0, 1.0) * (n_h - 1)
-        x = dr.log(1.0 + mu / self._knee) / self._log_range * (n_mu - 1)
-        row = dr.minimum(t.UInt(y), n_h - 2)
-        column = dr.minimum(t.UInt(x), n_mu - 2)
-        fy, fx = y - t.Float(row), x - t.Float(column)
-        corner = row * n_mu + column
+        cosines = self._cosines
+        position = dr.cbrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
+        shell = t.UInt(dr.gather(t.Float, self._shell_of_cell, dr.minimum(t.UInt(position), _CELLS), active))
+        _, high, _, _ = packet(self._bounds, shell, 4, active)
+        shell = dr.select((h >= high) & (shell + 1 < self._shells), shell + 1, shell)
+        low, high, per_width, _ = packet(self._bounds, shell, 4, active)
+        depth = dr.clip((high - h) * per_width, 0.0, 1.0)
+        y = dr.sqrt(depth) * self._rows
+        row = dr.minimum(t.UInt(y), self._rows - 1)
+        start = t.Float(row)
+        by_root = y - start
+        by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
+        x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
+        column = dr.minimum(t.UInt(x), cosines - 2)
+        fx = x - t.Float(column)
+        corner = dr.fma(shell, self._rows + 1, row) * cosines + column
         n = self._count
-        a, b, c, d = (packet(self._table, corner + offset, n, active) for offset in (0, 1, n_mu, n_mu + 1))
-        path = distance_up(self.optics.radius, h, mu, top)
+        a, b, c, d = (packet(self._table, corner + offset, n, active) for offset in (0, 1, cosines, cosines + 1))
+        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         result = []
         for k in range(n):
+            fy = by_altitude if self._logarithmic[k] else by_root
             mean = dr.lerp(dr.lerp(a[k], b[k], fx), dr.lerp(c[k], d[k], fx), fy)
             result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
         return result
@@ -102,7 +119,7 @@ class SunColumns:
 def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:
     """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the profile's breaks."""
     t = types()
-    breaks = dr.opaque(t.Float, 0) if len(optics.breaks_m) == 0 else t.Float(optics.breaks_m.astype(np.float32))
+    breaks = floats(optics.breaks_m)
     x, w = gauss_legendre(NODES_PER_LAYER)
 
     def layer(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:

@@ -11,7 +11,8 @@ from typing import Any
 
 import drjit as dr
 
-from .backend import floats, packet, padded, types
+from .backend import floats, packet, padded, stored, types
+from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
@@ -25,15 +26,17 @@ class Field:
     one order more.
     """
 
-    def __init__(self, optics: Optics, grid: Grid, refine: Refinement, light: Order | None, sky: Any) -> None:
-        self.optics, self.grid = optics, grid
+    def __init__(
+        self, optics: Optics, columns: SunColumns, grid: Grid, refine: Refinement, light: Order | None, sky: Any
+    ) -> None:
+        self.optics, self.columns, self.grid = optics, columns, grid
         self.log_reference = refine.log_reference
-        self.sky = refine.both(sky)
+        self.sky = refine.both(self._per_depth(sky))
         self.light = light
         if light is None:
             return
         self.degree = light.degree
-        self.moments, self.reflected = refine.both(light.moments), refine.both(light.sky)
+        self.moments, self.reflected = refine.both(light.moments), refine.both(self._per_depth(light.sky))
         chi = [optics.phase_moments(k, self.degree) for k in optics.scatterers]
         self._chi = _interleave([[chi[i][c] for c in range(optics.channel_count)] for i in range(len(chi))], self.degree)
         l_, m = pairs(self.degree)
@@ -52,22 +55,34 @@ class Field:
         channels = range(self.optics.channel_count)
         return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
 
+    def _per_depth(self, irradiance: Any) -> Any:
+        """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish, and smooth up to it."""
+        t, size = types(), padded(self.optics.channel_count)
+        altitudes, suns = self.grid.shape
+        above = self._depth_above(floats(self.grid.h))
+        per_altitude = stored([dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above], dr.arange(t.UInt, altitudes), size)
+        lane = dr.arange(t.UInt, altitudes * suns * size)
+        below_top = dr.select(lane >= (altitudes - 1) * suns * size, lane - suns * size, lane)
+        return dr.gather(t.Float, irradiance, below_top) * dr.gather(t.Float, per_altitude, below_top // (suns * size) * size + lane % size)
+
+    def _depth_above(self, h: Any) -> list[Any]:
+        return self.optics.scattering_depths(self.columns.toward(h, types().Float(1.0)))
+
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
 
-        ``reflected``: only of the light whose reflection by that surface is still counted. Between two levels it is interpolated
-        geometrically: above the ground it falls with the air that is left above.
+        ``reflected``: only of the light whose reflection by that surface is still counted.
         """
-        buffer = self.reflected if reflected else self.sky
-        channels, size, suns = self.optics.channel_count, padded(self.optics.channel_count), self.grid.sources
-        k, fk = self.grid.locate_altitude(h)
-        s, fs = self.grid.locate_sun(mu_s)
-        levels = []
-        for node in (k * suns + s, (k + 1) * suns + s):
-            logs = [packet(self.log_reference, node + i, size, active) for i in (0, 1)]
-            values = [packet(buffer, node + i, size, active) for i in (0, 1)]
-            levels.append([dr.exp(dr.lerp(*(v[c] for v in logs), fs)) * dr.lerp(*(v[c] for v in values), fs) for c in range(channels)])
-        return [_geometric(dr.maximum(a, 0.0), dr.maximum(b, 0.0), fk) for a, b in zip(*levels, strict=True)]
+        channels, size = range(self.optics.channel_count), padded(self.optics.channel_count)
+        if not self.optics.scatterers:
+            return [0.0 * h for _ in channels]
+        nodes, weights, scales = self._corners(h, mu_s, active)
+        values = [packet(self.reflected if reflected else self.sky, node, size, active) for node in nodes]
+        above = self._depth_above(h)
+        return [
+            dr.maximum(_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in values]), 0.0) * above[c]
+            for c in channels
+        ]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel] (march.Source)."""
@@ -108,13 +123,6 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
     for weight, value in zip(weights[1:], values[1:], strict=True):
         total = dr.fma(weight, value, total)
     return total
-
-
-def _geometric(a: Any, b: Any, f: Any) -> Any:
-    """a^(1-f) b^f; linear where one of them is hardly there (at the top nothing arrives from above)."""
-    near = dr.minimum(a, b) > 1e-3 * dr.maximum(a, b)
-    ratio = dr.select(near, b / dr.select(near, a, 1.0), 1.0)
-    return dr.select(near, a * dr.exp(f * dr.log(ratio)), dr.lerp(a, b, f))
 
 
 def _interleave(chi: list[list[Any]], degree: int) -> Any:

@@ -35,24 +35,24 @@ def solve(optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolutio
     r, channels = resolution, optics.channel_count
     fine = Directions.at_nodes(grid, r.first_up, r.first_down)
     project = Projection(grid, fine, r.first_azimuths, r.first_degree, channels)
-    moments, sky = project(first_order(optics, columns, grid, fine, r.first_azimuths))
+    moments, sky = project(first_order(optics, columns, grid, fine, r.first_azimuths, r.phase_degree))
     zeroth = Order(moments, sky, r.first_degree, project.size).zeroth()
     refine = Refinement(grid, zeroth.numpy().reshape(*grid.shape, project.size))
     light = _relative(refine, moments, sky, r.first_degree)
     if orders == 1:
-        return Field(optics, grid, refine, None, light.sky)
+        return Field(optics, columns, grid, refine, None, light.sky)
     gather = Gather(optics, grid, Directions.at_nodes(grid, r.up, r.down), r.azimuths)
     project = Projection(grid, gather.directions, r.azimuths, r.degree, channels)
     total, ratio = light, None
     for order in range(2, (orders or r.orders) + 1):
         before, light = light, _relative(refine, *project(gather(refine, light)), r.degree)
         if order == orders:
-            return Field(optics, grid, refine, total, total.sky + light.sky)
+            return Field(optics, columns, grid, refine, total, total.sky + light.sky)
         total = total.plus(light)
         if orders is None:
             earlier, ratio = ratio, _ratio(grid, light, before)
             if order == r.orders or (earlier is not None and _tail_error(grid, total, light, ratio, earlier) < 0.1 * tolerance):
-                return Field(optics, grid, refine, *_with_tail(total, light, ratio))
+                return Field(optics, columns, grid, refine, *_with_tail(total, light, ratio))
     raise AssertionError("unreachable")
 
 

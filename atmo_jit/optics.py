@@ -18,6 +18,7 @@ from .backend import channels, floats, parameter, types
 from .profile import Exponential, Tabulated, Tent
 
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
+LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)  # scale heights at which rays are cut: the field is asked once between two cuts
 
 
 class Optics:
@@ -41,7 +42,6 @@ class Optics:
         self.scatterers = [k for k, c in enumerate(self.constituents) if c.phase is not None and np.any(c.scattering_per_m > 0)]
         self._profiles = [_with_parameters(c.profile) for c in self.constituents]
         self._phases = [_phases(c, indices) for c in self.constituents]
-        self._has_ground_light = bool(np.any(atmosphere.ground_albedo > 0))
 
     def densities(self, h: Any) -> list[Any]:
         """Relative density of every constituent at altitude ``h`` (m)."""
@@ -55,6 +55,16 @@ class Optics:
         """Optical depth per channel of the column densities (m) of all constituents."""
         return [self._sum(channel, columns) for channel in range(self.channel_count)]
 
+    def scattering_depths(self, columns: list[Any]) -> list[Any]:
+        """Scattering optical depth per channel of the column densities (m) of all constituents."""
+        depths = []
+        for channel in range(self.channel_count):
+            total = 0.0 * columns[0] if columns else 0.0
+            for k in self.scatterers:
+                total = dr.fma(self.scattering[k][channel], columns[k], total)
+            depths.append(total)
+        return depths
+
     def _sum(self, channel: int, amounts: list[Any]) -> Any:
         total = 0.0
         for extinction, amount in zip(self.extinction, amounts, strict=True):
@@ -66,6 +76,23 @@ class Optics:
         phases = self._phases[constituent]
         values = {id(p): p.value(nu) for p in phases}
         return [values[id(p)] for p in phases]
+
+    def smoothed_phase_values(self, constituent: int, nu: Any, degree: int) -> list[Any]:
+        """The Legendre series of the phase function up to ``degree``, per channel: without what a coarse set of directions cannot see."""
+        t = types()
+        chi = self.phase_moments(constituent, degree)
+        count = dr.opaque(t.UInt, degree + 1, 1)
+
+        def term(l_: Any, current: Any, last: Any, sums: list[Any]) -> tuple[Any, ...]:
+            n = t.Float(l_)
+            sums = [dr.fma((2.0 * n + 1.0) * dr.gather(t.Float, c, l_), current, s) for c, s in zip(chi, sums, strict=True)]
+            following = ((2.0 * n + 1.0) * nu * current - n * last) / (n + 1.0)
+            return l_ + 1, following, current, sums
+
+        zero = dr.zeros(t.Float, dr.width(nu))
+        state = (t.UInt(0), zero + 1.0, zero, [zero + 0.0 for _ in chi])
+        *_, sums = dr.while_loop(state, lambda l_, *_: l_ < count, term, label="phase")
+        return [s * (0.25 / dr.pi) for s in sums]
 
     def phase_moments(self, constituent: int, degree: int) -> list[Any]:
         """Legendre moments chi_0..chi_degree per channel: a list of C Float buffers of length degree + 1."""
@@ -79,7 +106,7 @@ class Optics:
         for c in self.constituents:
             levels += [k for k in c.profile.kinks_m]
             if isinstance(c.profile, Exponential):
-                levels += [c.profile.scale_height_m * f for f in (1.0, 2.5, 5.0, 9.0)]
+                levels += [c.profile.scale_height_m * f for f in LEVELS]
         levels = np.unique(np.clip(levels, 0.0, top))
         kinks = {k for c in self.constituents for k in c.profile.kinks_m}
         # A scale-height level beside another break only costs time; kinks stay.
@@ -93,12 +120,17 @@ class Optics:
 
     @cached_property
     def edge_levels_m(self) -> list[float]:
-        """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top and the corners of tents.
+        """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top, corners of tents, steps of tables.
 
-        A tabulated profile's corners are many and slight; they are left to the quadrature.
+        A tabulated profile's other corners are many and slight; they are left to the quadrature.
         """
         top = self.atmosphere.thickness_m
-        kinks = {k for c in self.constituents if isinstance(c.profile, Tent) for k in c.profile.kinks_m}
+        kinks: set[float] = set()
+        for profile in (c.profile for c in self.constituents):
+            if isinstance(profile, Tent):
+                kinks.update(profile.kinks_m)
+            if isinstance(profile, Tabulated):
+                kinks.update(profile.steps_m)
         return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
 
 

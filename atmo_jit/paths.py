@@ -12,16 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from .grid import Grid
-from .quadrature import split_directions
+from .quadrature import facing_up, split_directions
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), the first ``up`` of them above the horizon."""
+    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), and ``facing_up`` [K, D], weights of the irradiance."""
 
     mu: np.ndarray
     weight: np.ndarray
-    up: int
+    facing_up: np.ndarray
 
     @classmethod
     def at_nodes(cls, grid: Grid, up: int, down: int) -> Directions:
@@ -29,7 +29,8 @@ class Directions:
         r = grid.radius_m + grid.h
         horizon = -np.sqrt(grid.h * (2.0 * grid.radius_m + grid.h)) / r
         mu, weight = zip(*(split_directions(m, up, down) for m in horizon), strict=True)
-        return cls(np.array(mu), np.array(weight), up)
+        facing = [np.concatenate([facing_up(m, up), np.zeros(down)]) for m in horizon]
+        return cls(np.array(mu), np.array(weight), np.array(facing))
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ class Resolution:
 
     ``altitudes``, ``suns``: nodes solved for; ``refine``: parts into which cubic interpolation divides every interval of either.
     ``up``, ``down``, ``azimuths``: directions at a node for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for
-    order 1, whose forward peak is sharper. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
+    order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
     sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
-    suns: int = 31
+    suns: int = 41
     refine: tuple[int, int] = (2, 3)
     up: int = 6
     down: int = 4
@@ -35,8 +35,9 @@ class Resolution:
     first_down: int = 8
     first_azimuths: int = 14
     first_degree: int = 12
+    phase_degree: int = 16
     orders: int = 20
-    columns: tuple[int, int] = (96, 128)
+    columns: tuple[int, int] = (128, 96)
 
     @classmethod
     def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
@@ -57,6 +58,7 @@ class Resolution:
             first_down=max(8, first // 2 + 2),
             first_azimuths=first + 4,
             first_degree=first,
+            phase_degree=max(16, first + 4),
         )
 
 

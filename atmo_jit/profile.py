@@ -100,6 +100,12 @@ class Tabulated:
         """Every altitude of the table, once (m)."""
         return tuple(float(h) for h in np.unique(self.altitude_m))
 
+    @property
+    def steps_m(self) -> tuple[float, ...]:
+        """The altitudes at which the density jumps (m): those given twice, and the last where the density there is not 0."""
+        twice = self.altitude_m[1:][np.diff(self.altitude_m) == 0.0].tolist()
+        return (*twice, *([float(self.altitude_m[-1])] if self.values[-1] > 0.0 else []))
+
     def density(self, h: Any) -> Any:
         """Relative density at altitude ``h`` (m)."""
         inside = piecewise_linear(h, self.altitude_m, self.values)

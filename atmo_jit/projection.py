@@ -26,8 +26,7 @@ class Projection:
         self._cosines = floats(np.cos(m[:, None] * half_circle(azimuths)) * (2.0 * np.pi / azimuths))
         basis = legendre(degree, directions.mu) * directions.weight[..., None]  # [K, D, pairs]
         self._basis = floats(basis)
-        upward = np.where(np.arange(self.count) < directions.up, directions.mu, 0.0)
-        self._upward = floats(np.maximum(upward, 0.0) * directions.weight)
+        self._upward = floats(directions.facing_up)
         self._m = uints(pairs(degree)[1])
         self._types = t
 

@@ -40,6 +40,21 @@ def split_directions(horizon_mu: float, count_up: int, count_down: int) -> tuple
     return mu, weight
 
 
+def facing_up(horizon_mu: float, count_up: int) -> np.ndarray:
+    """Weights [count_up] on the directions above the horizon of split_directions: integral of mu f(mu) over mu in [0, 1].
+
+    Aloft the horizon lies below mu = 0, where a horizontal surface stops seeing: the weights integrate the polynomial through the nodes from
+    there on. At the ground they are mu times the usual ones.
+    """
+    x, _ = gauss_legendre(count_up)
+    span = 1.0 - horizon_mu
+    start = np.sqrt(-horizon_mu / span)
+    at, weight = gauss_legendre(count_up + 2)
+    at, weight = start + (1.0 - start) * at, (1.0 - start) * weight
+    basis = np.array([np.prod([(at - x[j]) / (x[i] - x[j]) for j in range(count_up) if j != i], axis=0) for i in range(count_up)])
+    return basis @ (weight * (horizon_mu + span * at**2) * span * 2.0 * at)
+
+
 def half_circle(count: int) -> np.ndarray:
     """Azimuths at the midpoints of ``count`` equal parts of [0, pi]: exact for cos(m phi), 0 < m < 2 count."""
     return (np.arange(count) + 0.5) * np.pi / count

@@ -18,8 +18,13 @@ from .paths import Directions
 from .quadrature import half_circle
 
 
-def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Directions, azimuths: int) -> Any:
-    """Radiance of order 1 at the nodes, [K, D, S, azimuths, channels]: single scattering and directly lit ground."""
+def first_order(
+    optics: Optics, columns: SunColumns, grid: Grid, directions: Directions, azimuths: int, phase_degree: int
+) -> Any:
+    """Radiance of order 1 at the nodes, [K, D, S, azimuths, channels]: single scattering and directly lit ground.
+
+    Phase functions are smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed by them.
+    """
     t = types()
     altitudes, suns = grid.shape
     count = directions.mu.shape[1]
@@ -32,7 +37,7 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
     cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
     nu = dr.clip(dr.fma(mu, mu_s, safe_sine(mu) * safe_sine(mu_s) * cos_phi), -1.0, 1.0)
     rays = rays_to_boundary(optics, h, mu, mu_s, nu)
-    light = march(optics, columns, rays)
+    light = march(optics, columns, rays, phase_degree=phase_degree)
     ground = ground_light(optics, columns, rays, None)
     values = [dr.fma(light.transmittance[c], ground[c], light.single[c]) for c in range(optics.channel_count)]
     return stored(values, lane, padded(optics.channel_count))

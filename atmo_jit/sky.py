@@ -9,24 +9,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from . import __version__
 from .atmosphere import Atmosphere
 from .backend import doubles, types
 from .column import SunColumns
-from .field import Field
-from .geometry import hits_ground
+from .errors import InputError
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve
-from .single_scattering import ground_light, sun_irradiance
 from .optics import MAX_CHANNELS, Optics
 from .plan import Resolution
+from .single_scattering import ground_light, sun_irradiance
+from .views import check_views
+
+METHODS = ("auto", "march")
+VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
 
 @dataclass
@@ -43,26 +47,31 @@ class _Band:
     def __init__(self, atmosphere: Atmosphere, indices: np.ndarray, resolution: Resolution, orders: int | None, tolerance: float) -> None:
         self.optics = Optics(atmosphere, indices)
         self.columns = SunColumns(self.optics, resolution.columns)
-        self.field: Field = solve(self.optics, self.columns, Grid(atmosphere, resolution), resolution, orders, tolerance)
+        self.field = solve(self.optics, self.columns, Grid(atmosphere, resolution), resolution, orders, tolerance)
         self.source = self.field if self.field.light is not None and self.optics.scatterers else None
 
 
 class Sky:
-    """The solved sky of an atmosphere: all sun angles, altitudes, directions. Solve once, evaluate many times.
+    """The solved sky of an atmosphere: all sun angles, altitudes and directions. Solve once, evaluate many times.
 
-    ``orders``: scattering and reflection events counted (1: single scattering and directly lit ground only; None: all).
-    ``tolerance``: relative error aimed at.
+    ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted (1: single scattering
+    and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which the resolution follows unless it is given.
+    Raises AtmosphereError, LLVMError, InputError.
     """
 
-    def __init__(self, atmosphere: Any, orders: int | None = None, tolerance: float = 0.01, resolution: Resolution | None = None) -> None:
+    def __init__(
+        self, atmosphere: Any, orders: int | None = None, tolerance: float = 0.01, resolution: Resolution | None = None
+    ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
-        self.orders = orders
-        self.tolerance = tolerance
+        if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
+            raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
+        if not 0.0 < tolerance < 1.0:
+            raise InputError(f"tolerance: is {tolerance!r}; must be a number between 0 and 1")
+        self.orders, self.tolerance = orders, tolerance
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
-        starts = range(0, count, MAX_CHANNELS)
-        bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in starts]
-        self._bands = [_Band(self.atmosphere, b, self.resolution, orders, tolerance) for b in bands]
+        bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
+        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance) for band in bands]
 
     def rays(
         self,
@@ -73,78 +82,99 @@ class Sky:
         distance_m: Any = None,
         *,
         ground: bool = True,
+        sun_disc: bool = False,
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
         Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too). ``azimuth`` is the
-        view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False`` leaves the ground's own radiance out.
+        view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False`` leaves the ground's own radiance out;
+        ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's ``sun_angular_radius_deg`` (nothing for a point sun).
         """
-        rays, hit, inside = self._enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
+        rays, meets_air, passes = self._enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
+        disc = self._disc(rays, passes) if sun_disc else None
         for band in self._bands:
             optics = band.optics
             light = march(optics, band.columns, rays, source=band.source)
             for c in range(optics.channel_count):
                 light.single[c] = light.single[c] + light.multiple[c]
             if ground:
-                ended = Rays(rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop, hit)
-                for c, glow in enumerate(ground_light(optics, band.columns, ended, band.field)):
+                for c, glow in enumerate(ground_light(optics, band.columns, rays, band.field)):
                     light.single[c] = dr.fma(light.transmittance[c], glow, light.single[c])
-            radiance += [dr.select(inside, value, 0.0) for value in light.single]
-            transmittance += [dr.select(inside, value, 1.0) for value in light.transmittance]
+            transmittance += [dr.select(meets_air, value, 1.0) for value in light.transmittance]
+            radiance += [dr.select(meets_air, value, 0.0) for value in light.single]
+            if disc is not None:
+                for c, solar in enumerate(optics.solar, len(radiance) - optics.channel_count):
+                    radiance[c] = dr.fma(disc * solar, transmittance[c], radiance[c])
         return RayLight(radiance, transmittance)
 
     def irradiance(self, altitude_m: Any, sun_zenith: Any) -> tuple[list[Any], list[Any]]:
-        """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``."""
+        """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``: lists of W Floats."""
         t = types()
-        h = t.Float(altitude_m)
-        mu_s = t.Float(dr.cos(t.Float64(sun_zenith)))
+        h, mu_s = t.Float(altitude_m), t.Float(dr.cos(t.Float64(sun_zenith)))
         sun, sky = [], []
         for band in self._bands:
             optics = band.optics
             inside = h < optics.thickness
             level = dr.minimum(h, optics.thickness)
-            sun += sun_irradiance(optics, band.columns, level, optics.radius + h, mu_s)
+            sun += sun_irradiance(optics, band.columns, h, optics.radius + h, mu_s)
             sky += [dr.select(inside, value, 0.0) for value in band.field.irradiance(level, mu_s)]
         return sun, sky
 
     def _enter(self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any) -> tuple[Rays, Any, Any]:
-        """Rays moved, in double precision, to where they enter the atmosphere; whether they end on the ground; whether they meet air at all."""
+        """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether they leave for space."""
         t = types()
         wide = t.Float64
         altitude, theta_s, theta, phi = (wide(v) for v in (altitude_m, sun_zenith, view_zenith, azimuth))
-        radius = wide(self.atmosphere.bottom_radius_m)
-        top = wide(self.atmosphere.thickness_m)
+        optics = self._bands[0].optics
+        radius, top = wide(optics.radius), wide(optics.thickness)
         mu, mu_s = dr.cos(theta), dr.cos(theta_s)
-        sin, sin_s = dr.sin(theta), dr.sin(theta_s)
-        nu = mu * mu_s + sin * sin_s * dr.cos(phi)
+        nu = mu * mu_s + dr.sin(theta) * dr.sin(theta_s) * dr.cos(phi)
         r = radius + altitude
         outside = altitude > top
         # Distance to the top from outside: the nearer root of d^2 + 2 r mu d + (altitude - top)(2R + altitude + top) = 0.
         excess = (altitude - top) * (2.0 * radius + altitude + top)
         square = (r * mu) ** 2 - excess
         meets = ~outside | ((mu < 0.0) & (square > 0.0))
-        gap = dr.select(outside & meets, excess / (dr.safe_sqrt(square) - r * mu), 0.0)
+        entering = outside & meets
+        gap = dr.select(entering, excess / dr.select(entering, dr.safe_sqrt(square) - r * mu, 1.0), 0.0)
         r_in = dr.select(outside, radius + top, r)
-        rays_mu = dr.select(outside, (r * mu + gap) / r_in, mu)
-        rays_mu_s = dr.select(outside, (r * mu_s + gap * nu) / r_in, mu_s)
+        cosines = (
+            dr.select(outside, (r * mu + gap) / r_in, mu),
+            dr.select(outside, (r * mu_s + gap * nu) / r_in, mu_s),
+            nu,
+        )
         h = t.Float(dr.minimum(altitude, top))
-        mu_f, mu_s_f, nu_f = (t.Float(dr.clip(v, -1.0, 1.0)) for v in (rays_mu, rays_mu_s, nu))
-        optics = self._bands[0].optics
-        rays = rays_to_boundary(optics, h, mu_f, mu_s_f, nu_f)
-        hit = rays.ground
-        if distance_m is not None:
-            left = t.Float(dr.maximum(wide(distance_m) - gap, 0.0))
-            hit = hit & (left >= rays.stop)
-            rays.stop = dr.minimum(rays.stop, left)
-        inside = t.Bool(meets)
-        rays.stop = dr.select(inside, rays.stop, 0.0)
-        return rays, hit & inside, inside
+        rays = rays_to_boundary(optics, h, *(t.Float(dr.clip(v, -1.0, 1.0)) for v in cosines))
+        meets_air = t.Bool(meets)
+        rays.stop = dr.select(meets_air, rays.stop, 0.0)
+        rays.ground &= meets_air
+        if distance_m is None:
+            return rays, meets_air, ~rays.ground
+        left = t.Float(dr.maximum(wide(distance_m) - gap, 0.0))
+        ends = left >= rays.stop
+        passes = ends & ~rays.ground & (meets_air | t.Bool(dr.isinf(wide(distance_m))))
+        rays.ground &= ends
+        rays.stop = dr.minimum(rays.stop, left)
+        return rays, meets_air, passes
+
+    def _disc(self, rays: Rays, passes: Any) -> Any:
+        """Radiance of the unattenuated solar disc per unit irradiance (1/sr), on the rays that meet it; uniform."""
+        radius = np.deg2rad(self.atmosphere.sun_angular_radius_deg)
+        if radius == 0.0:
+            return dr.zeros(types().Float, 1)
+        solid_angle = 4.0 * np.pi * np.sin(0.5 * radius) ** 2
+        return dr.select(passes & (1.0 - rays.nu <= 2.0 * np.sin(0.5 * radius) ** 2), 1.0 / solid_angle, 0.0)
 
 
 @dataclass
 class SkyResult:
-    """float32 arrays [N, W] and what was done: ``radiance``, ``transmittance``, ``sun_irradiance``, ``sky_irradiance``, ``meta``."""
+    """What ``sky`` returns: float32 arrays [N, W] and ``meta``.
+
+    ``radiance`` (W m^-2 sr^-1 nm^-1 for the atmosphere's solar irradiance; 1/sr where that is 1), ``transmittance`` along the ray,
+    ``sun_irradiance`` and ``sky_irradiance`` on a horizontal surface at the observer (W m^-2 nm^-1); ``meta``: version, seconds, tolerance,
+    orders, method and the plan (resolution) of the solve.
+    """
 
     radiance: np.ndarray
     transmittance: np.ndarray
@@ -162,18 +192,53 @@ def sky(
     ground: bool = True,
     sun_disc: bool = False,
     method: str = "auto",
-    progress: Any = None,
+    progress: Callable[[float], None] | None = None,
 ) -> SkyResult:
-    t = types()
-    arrays = np.broadcast_arrays(*(np.atleast_1d(np.asarray(views[n], dtype=np.float64)) for n in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")))
+    """Radiance, transmittance and irradiances for a list of views.
+
+    ``atmosphere``: preset name, JSON file, dict or Atmosphere. ``views``: mapping with ``altitude_m``, ``sun_zenith_deg``, ``view_zenith_deg``,
+    ``azimuth_deg`` and optionally ``distance_m``: numbers or 1-D arrays of one length N (see atmo_jit.views). ``orders``: scattering and
+    reflection events counted (None: all, to ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the
+    sun's. ``method``: "march" integrates every ray; "auto" chooses. ``progress`` is called with the fraction done.
+
+    Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad atmosphere, LLVMError
+    without a usable LLVM.
+    """
+    if method not in METHODS:
+        raise InputError(f"method: is {method!r}; must be one of {', '.join(METHODS)}")
+    air = Atmosphere.load(atmosphere)
+    checked = check_views(views)
     start = time.perf_counter()
-    solved = Sky(atmosphere, orders, tolerance)
-    altitude = doubles(arrays[0])
-    angles = [doubles(np.deg2rad(a)) for a in arrays[1:]]
-    distance = None if views.get("distance_m") is None else doubles(np.broadcast_to(views["distance_m"], arrays[0].shape))
-    light = solved.rays(altitude, *angles, distance, ground=ground)
+    solved = Sky(air, orders, tolerance)
+    solve_seconds = time.perf_counter() - start
+    count = len(checked["altitude_m"])
+    parts = []
+    for first in range(0, count, VIEWS_AT_ONCE):
+        parts.append(_evaluate(solved, {name: v[first : first + VIEWS_AT_ONCE] for name, v in checked.items()}, ground, sun_disc))
+        if progress is not None:
+            progress(min(first + VIEWS_AT_ONCE, count) / count)
+    arrays = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    meta = {
+        "atmo_jit": __version__,
+        "seconds": time.perf_counter() - start,
+        "solve_seconds": solve_seconds,
+        "tolerance": tolerance,
+        "orders": orders,
+        "method": "march",
+        "wavelengths_nm": air.wavelengths_nm.tolist(),
+        "plan": asdict(solved.resolution),
+    }
+    return SkyResult(*arrays, meta)
+
+
+def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_disc: bool) -> list[np.ndarray]:
+    """The four arrays of a SkyResult for some of its views."""
+    altitude = doubles(views["altitude_m"])
+    angles = [doubles(np.deg2rad(views[name])) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
+    distance = doubles(views["distance_m"]) if "distance_m" in views else None
+    light = solved.rays(altitude, *angles, distance, ground=ground, sun_disc=sun_disc)
     sun, scattered = solved.irradiance(altitude, angles[0])
-    dr.eval(light.radiance, light.transmittance, sun, scattered)
-    stack = lambda values: np.stack([np.broadcast_to(np.array(v), arrays[0].shape) for v in values], axis=-1).astype(np.float32)
-    out = [stack(v) for v in (light.radiance, light.transmittance, sun, scattered)]
-    return SkyResult(*out, {"seconds": time.perf_counter() - start})
+    groups = (light.radiance, light.transmittance, sun, scattered)
+    dr.eval(groups)
+    shape = views["altitude_m"].shape
+    return [np.stack([np.broadcast_to(v.numpy(), shape) for v in group], axis=-1).astype(np.float32) for group in groups]

@@ -101,7 +101,7 @@ def timed(work: Callable[[], None], repeats: int = 7) -> tuple[float, float]:
     return tuple(statistics.median(run[i] for run in runs) for i in (0, 1))
 
 
-def in_process(name: str = "earth", rays: int = 1_000_000) -> list[Row]:
+def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
     """Warm solve, solve of an atmosphere that changes each time, and evaluation of many rays."""
     import drjit as dr
     from drjit.llvm.ad import Float
@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.speed", description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--atmosphere", default="earth", help="preset or JSON file")
-    parser.add_argument("--rays", type=int, default=1_000_000, help="rays of the throughput rows")
+    parser.add_argument("--rays", type=int, default=200_000, help="rays of the throughput rows")
     parser.add_argument("--part", choices=("all", "processes", "solve"), default="all")
     options = parser.parse_args(arguments)
     rows = whole_processes(options.atmosphere) if options.part != "solve" else []

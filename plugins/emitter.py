@@ -237,7 +237,7 @@ loaded; in scalar variants call ``emitter.set_scene(scene)`` first.
             self._sky = Sky(self._atmosphere)
             self._channels = Channels(SpectralBasis.of(self._atmosphere))
         altitude = float(_host(self._values["altitude"])[0])
-        self._view = Panorama.of(self._atmosphere.bottom_radius_m, altitude, math.atan2(across, z))
+        self._view = Panorama.of(self._atmosphere.bottom_radius_m, self._atmosphere.thickness_m, altitude, math.atan2(across, z))
         self._sky_table = self._channels.tensor(solve_sky(self._sky, self._view), SKY_SHAPE)
 
         aperture = max(2.0 * self._atmosphere.sun_angular_radius_deg, settings.SMALLEST_SUN_DEG)
@@ -279,17 +279,19 @@ loaded; in scalar variants call ``emitter.set_scene(scene)`` first.
     def _radiance(self, where: tuple[Any, Any, Any], wavelengths: Any, active: Any) -> Any:
         a, place, distance2 = where
         at = self._lookup.node(a, place)
-        sky = self._channels.read(self._sky_texture, at.x, at.y, wavelengths, active) * _single(self._values["sky_scale"])
+        covered = active & self._lookup.covers(a)
+        sky = self._channels.read(self._sky_texture, at.x, at.y, wavelengths, covered) * _single(self._values["sky_scale"])
         seen = self._in_disc(distance2, active) & (a >= 0.0)
         x, y = self._disc_lookup.node(a, distance2)
         sun = self._channels.read(self._sun_texture, x, y, wavelengths, seen) * _single(self._values["sun_scale"])
-        total = sky + dr.select(seen, sun, 0.0)
+        total = dr.select(covered, sky, 0.0) + dr.select(seen, sun, 0.0)
         return mi.depolarizer(dr.select(active, total, 0.0))
 
     def _density(self, where: tuple[Any, Any, Any], active: Any) -> Any:
         a, place, distance2 = where
         sun = dr.select(self._in_disc(distance2, active), self._disc_lookup.density, 0.0)
-        pdf = dr.fma(self._share, sun, self._rest * self._lookup.pdf(a, place, active))
+        sky = dr.select(self._lookup.covers(a), self._lookup.pdf(a, place, active), 0.0)
+        pdf = dr.fma(self._share, sun, self._rest * sky)
         return dr.select(active, pdf, 0.0)
 
     def _sample(self, sample: Any, active: Any) -> Any:

@@ -61,6 +61,8 @@ class SkyLookup:
 
     def __init__(self, view: Panorama, luminance: np.ndarray) -> None:
         self.dip = number(view.dip)
+        # A little beyond the zenith where the table covers the whole sky: rounding must not cut it off there.
+        self.highest = number(view.up.length if view.up.length < view.horizon_zenith else 4.0)
         self.up, self.down, self.around = WarpLookup(view.up), WarpLookup(view.down), WarpLookup(view.around)
         sines, azimuths = view.cells()
         self.sines = texture(sines[:, None])
@@ -77,6 +79,10 @@ class SkyLookup:
     def elevation(self, z: Any, across: Any) -> Any:
         """Elevation above the horizon (rad) of a direction with height ``z`` and horizontal length ``across``."""
         return dr.atan2(z, across) + self.dip
+
+    def covers(self, a: Any) -> Any:
+        """Whether the table has this elevation; the sky above the limb, seen from space, is black."""
+        return a <= self.highest
 
     def place(self, a: Any, phi: Any) -> tuple[Any, Any, Any]:
         """Columns, row below the horizon and row above it, each as a fraction in [0, 1] counted from the sun or from the horizon."""

@@ -19,7 +19,7 @@ import numpy as np
 
 # Rows above and below the horizon, columns from the sun to its opposite. Interpolation error against the solver at random directions:
 # see tests/plugins/test_panorama.py.
-ROWS_UP, ROWS_DOWN, COLUMNS = 128, 48, 72
+ROWS_UP, ROWS_DOWN, COLUMNS = 128, 64, 72
 SUN_ROWS, SUN_COLUMNS = 49, 17
 AUREOLE_RAD = math.radians(1.0)
 # A ray this close to the horizon is decided by rounding: the first rows stand this far off it.
@@ -82,17 +82,26 @@ class Panorama:
     around: Warp
 
     @classmethod
-    def of(cls, radius_m: float, altitude_m: float, sun_zenith: float) -> Panorama:
-        """``dip``: how far the horizon lies below the horizontal, acos(R / (R + h)) without cancellation."""
-        dip = math.atan2(math.sqrt(altitude_m * (2.0 * radius_m + altitude_m)), radius_m)
-        horizon = 0.5 * math.pi + dip
-        sun_height = min(max(horizon - sun_zenith, 0.0), horizon)
+    def of(cls, radius_m: float, thickness_m: float, altitude_m: float, sun_zenith: float) -> Panorama:
+        """The table of a planet of ``radius_m`` with air up to ``thickness_m``.
+
+        ``dip``: how far the horizon lies below the horizontal, acos(R / (R + h)) without cancellation. From above the air the table ends at
+        the top of the limb: the rest of the sky is black.
+        """
         distance = math.sqrt(altitude_m * (2.0 * radius_m + altitude_m))
+        dip = math.atan2(distance, radius_m)
+        horizon = highest = 0.5 * math.pi + dip
+        if altitude_m > thickness_m:
+            above = altitude_m - thickness_m
+            top = radius_m + thickness_m
+            highest = max(dip - math.atan2(math.sqrt(above * (2.0 * top + above)), top), 4.0 * EDGE_RAD)
+        sun_height = min(max(horizon - sun_zenith, 0.0), highest)
         # Seen from space the air is a thin line on the horizon: two kilometres of it set the scale there, 0.2 degrees near the ground.
         haze = min(math.radians(0.2), 2000.0 / max(distance, 1.0))
-        up = Warp.around(horizon, (0.0, haze, 0.4), (sun_height, AUREOLE_RAD, 0.25))
+        up = Warp.around(highest, (0.0, haze, 0.4), (sun_height, AUREOLE_RAD, 0.25))
         # Below the horizon radiance follows the distance to the ground, which changes on the scale of the dip.
-        down = Warp.around(0.5 * math.pi - dip, (0.0, max(dip / 30.0, 1e-5), 0.85))
+        share = 0.75 if altitude_m < thickness_m else 0.4
+        down = Warp.around(0.5 * math.pi - dip, (0.0, max(min(dip / 30.0, haze), 1e-5), share))
         # A degree around the sun is 1 / cos(elevation) degrees of azimuth.
         width = min(AUREOLE_RAD / max(math.sin(sun_zenith), 1e-3), math.radians(60.0))
         return cls(altitude_m, sun_zenith, dip, up, down, Warp.around(math.pi, (0.0, width, 0.55)))
@@ -108,7 +117,7 @@ class Panorama:
         return self.horizon_zenith - self.sun_zenith
 
     def rows(self) -> np.ndarray:
-        """``a`` at the table's rows [ROWS_DOWN + 1 + ROWS_UP + 1]: from nadir up to the horizon, from the horizon up to the zenith."""
+        """``a`` at the table's rows [ROWS_DOWN + 1 + ROWS_UP + 1]: from nadir up to the horizon, from the horizon to the zenith or limb."""
         return np.concatenate([-self.down.nodes(ROWS_DOWN + 1)[::-1], self.up.nodes(ROWS_UP + 1)])
 
     def columns(self) -> np.ndarray:

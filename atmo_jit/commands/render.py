@@ -54,7 +54,7 @@ def command(
 
     \b
     atmo-jit render noon --out noon.exr
-    atmo-jit render sunset --out sunset.exr --spp 256 --width 1280 -D mie_g=0.8
+    atmo-jit render sunset --out sunset.exr --spp 256 --width 1280 -D "sun=0, 1, 0.02"
     """
     if list_scenes:
         for name, path in scenes.shipped().items():
@@ -92,7 +92,9 @@ def command(
         write_png(png_part, display(picture.rgb, exposure))
     invalid = int(picture.invalid.sum())
     if invalid:
-        _warn(f"{invalid} of {picture.invalid.size} pixels are NaN or infinite: kept in {exr.name}, magenta in {png.name}")
+        _warn(
+            f"{invalid} of {picture.invalid.size} pixels are NaN or infinite: kept in {exr.name}, magenta in {png.name}"
+        )
     if not quiet:
         rows, columns = picture.pixels.shape[:2]
         click.echo(f"{out} and {png.name}: {columns}x{rows}, {samples} samples per pixel, {seconds:.1f} s")
@@ -190,7 +192,8 @@ def _mitsuba(variant: str) -> Iterator[None]:
 
         def append(self, level: Any, text: str) -> None:
             text = one_line(re.sub(r"^\S+ \S+ WARN\s+", "", text))
-            if text not in self.seen:
+            # Ctrl-C is announced as a warning too; the command line has its own word for that.
+            if text not in self.seen and "interrupt signal" not in text:
                 self.seen.add(text)
                 _warn(text)
 

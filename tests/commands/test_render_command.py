@@ -166,6 +166,24 @@ def test_invalid_pixels_are_reported_and_painted(run, scene, tmp_path, monkeypat
     assert np.isnan(read_exr(tmp_path / "x.exr")[0]["G"][2, 3])
 
 
+@pytest.mark.parametrize("name", scenes.shipped())
+def test_every_shipped_scene_renders(run, tmp_path, name):
+    status, _, err = run(name, "--out", tmp_path / "x.exr", "--width", 48, "--spp", 16, "--quiet")
+    assert (status, err) == (0, "")
+    rgb = np.stack([read_exr(tmp_path / "x.exr")[0][channel] for channel in "RGB"], axis=-1)
+    assert rgb.shape == (27, 48, 3) and np.isfinite(rgb).all()
+    assert rgb.mean() > 0 and np.quantile(rgb, 0.01) >= 0
+    shown = read_png(tmp_path / "x.png")
+    assert 60 < shown.mean() < 200 and shown.std() > 20
+
+
+def test_what_the_emitter_says_is_one_line(run, tmp_path):
+    for name in ("noon", "ball"):
+        status, _, err = run(name, "--out", tmp_path / "x.exr", "-D", "atmosphere=venus")
+        assert status == 2 and err.count("\n") == 1
+        assert "atmosphere: found 'venus'" in err and "Traceback" not in err and str(scenes.find(name)) in err
+
+
 MISTAKES = {
     "no scene": (["--out", "OUT"], "SCENE is missing; give a file or one of the shipped scenes: "),
     "no output": (["SCENE"], "--out is missing; give the .exr file to write"),
@@ -229,7 +247,7 @@ def test_an_interrupted_run_leaves_everything_as_it_was(run, scene, tmp_path, mo
 
 
 def test_list_names_every_shipped_scene_without_mitsuba(tmp_path):
-    code = "import sys; from atmo_jit.cli import main; s = main(['render', '--list']); sys.exit(s or 'mitsuba' in sys.modules)"
+    code = "import sys; from atmo_jit.cli import main; sys.exit(main(['render', '--list']) or 'mitsuba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert [line.split()[0] for line in done.stdout.splitlines()] == list(scenes.shipped())

@@ -232,8 +232,8 @@ def test_mistakes_in_xml(tmp_path, change, message):
 def test_what_a_plugin_says_is_shown_without_its_traceback():
     from atmo_jit.scenes.reader import what_mitsuba_says
 
-    text = '[parser.cpp:1718] At string (line 8): failed: Traceback (most recent call last):\n  File "b.py"\nValueError: g is 2'
-    assert what_mitsuba_says(text) == "At string (line 8): failed: g is 2"
+    trace = 'Traceback (most recent call last):\n  File "b.py", line 5, in __init__\nValueError: g is 2'
+    assert what_mitsuba_says(f"[parser.cpp:1718] At line 8: failed: {trace}") == "At line 8: failed: g is 2"
 
 
 def test_finding_scenes(tmp_path, monkeypatch):

@@ -74,7 +74,7 @@ def test_writes_what_the_contract_says(run, views, tmp_path):
         assert arrays[name].dtype == np.float32 and arrays[name].shape == (3, 3)
         assert np.isfinite(arrays[name]).all() and (arrays[name] >= 0).all()
     meta = json.loads(str(arrays["meta"]))
-    assert meta["version"] == atmo_jit.__version__ and meta["seconds"] > 0 and meta["tolerance"] == 0.01
+    assert meta["atmo_jit"] == atmo_jit.__version__ and meta["seconds"] > 0 and meta["tolerance"] == 0.01
     assert "plan" in meta
 
 

@@ -1,0 +1,341 @@
+"""Unbiased truth for any atmosphere: spherical backward Monte Carlo in double precision.
+
+It shares no code with the package. Order 1 and directly lit ground come from the tests' quadrature twin, exactly; this adds
+orders >= 2 and their noise. One process per question::
+
+    python -m bench.monte_carlo --atmosphere FILE.json --views VIEWS.npz --out TRUTH.npz --paths 400000
+
+VIEWS.npz as for ``atmo-jit sky``; TRUTH.npz holds ``radiance`` and ``sigma`` (one standard error) [N, W].
+
+Method. Everything that depends on the atmosphere is tabulated finely from the twin: densities over altitude (linear), columns to the
+sun over altitude and cosine for rising rays (a sinking ray is twice its perigee's less its own), quantiles of the distance to the first
+event along every view ray, quantiles of every phase function. The first event of a path is forced; from there on free paths are sampled by
+delta tracking with a majorant per shell, directions from the phase function, and at every event but the first the sun is asked for.
+Russian roulette ends paths after eight events.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+from drjit.llvm.ad import PCG32, Bool, Float64, UInt32
+
+DENSITY_NODES, QUANTILES, SHELLS = 8192, 4096, 48
+COLUMNS = (500, 360)  # altitudes, cosines
+ROULETTE_FROM, MOST_EVENTS = 8, 400
+
+
+def load_twins():
+    """The tests' module of twins, wherever this is run from."""
+    path = Path(__file__).resolve().parents[1] / "tests" / "twins.py"
+    spec = importlib.util.spec_from_file_location("twins", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault("twins", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def buffer(values: np.ndarray) -> Float64:
+    """A flat double-precision buffer."""
+    return Float64(np.ascontiguousarray(values, dtype=np.float64).ravel())
+
+
+def lookup(table: Float64, position: Float64, count: int, offset: UInt32 | int = 0) -> Float64:
+    """Linear interpolation at a position in [0, count - 1] of the ``count`` numbers that start at ``offset``."""
+    index = dr.minimum(UInt32(dr.maximum(position, 0.0)), count - 2)
+    fraction = dr.clip(position - Float64(index), 0.0, 1.0)
+    low, high = (dr.gather(Float64, table, offset + index + step) for step in (0, 1))
+    return dr.fma(high - low, fraction, low)
+
+
+class MonteCarlo:
+    """Tables of an atmosphere (a ``twins.Twin``) and the random walk through it."""
+
+    def __init__(self, twin) -> None:
+        self.twin, self.width = twin, twin.width
+        self.radius, self.top = twin.radius, twin.top
+        species = twin.species
+        self.count = len(species)
+        h = np.linspace(0.0, self.top, DENSITY_NODES)
+        density = np.array([s.density(h) for s in species])
+        self.density = [buffer(d) for d in density]
+        self.scattering = [buffer(s.scattering) for s in species]
+        self.extinction = [buffer(s.extinction) for s in species]
+        levels = self.top * (np.arange(SHELLS + 1) / SHELLS) ** 1.5
+        shell = np.clip(np.searchsorted(levels, h, side="right") - 1, 0, SHELLS - 1)
+        total = np.array([[sum(s.extinction[w] * d for s, d in zip(species, density, strict=True))] for w in range(self.width)])
+        largest = np.zeros((self.width, SHELLS))
+        for offset in (-1, 0, 1):  # a shell's majorant holds for interpolation across its edges too
+            np.maximum.at(largest.T, np.clip(np.roll(shell, offset), 0, SHELLS - 1), total[:, 0].T)
+        self.majorant, self.levels = buffer(largest * 1.0001 + 1e-30), buffer(levels)
+        self._tabulate_columns()
+        self._tabulate_phases()
+        self.albedo = buffer(twin.albedo)
+
+    def _tabulate_columns(self) -> None:
+        n_h, n_mu = COLUMNS
+        self.knee = 0.01
+        h = self.top * (np.arange(n_h) / (n_h - 1)) ** 2
+        mu = self.knee * np.expm1(np.arange(n_mu) / (n_mu - 1) * np.log1p(1 / self.knee))
+        grid = np.meshgrid(h, np.minimum(mu, 1.0), indexing="ij")
+        parts = [self.twin.columns(a, b) for a, b in zip(*(np.array_split(g.ravel(), 60) for g in grid), strict=True)]
+        self.sun_columns = [buffer(column) for column in np.concatenate(parts).T]
+
+    def _tabulate_phases(self) -> None:
+        x = np.linspace(0.0, np.pi, 200_001)
+        nu = np.cos(x)
+        rank = np.linspace(0.0, 1.0, QUANTILES)
+        self.phase_value, self.phase_quantile = [], []
+        for s in self.twin.species:
+            if s.phase is None:
+                self.phase_value.append(None)
+                self.phase_quantile.append(None)
+                continue
+            p = s.phase(nu) * np.sin(x)[:, None]
+            cumulative = np.vstack([np.zeros(self.width), np.cumsum((p[1:] + p[:-1]) / 2, axis=0)])
+            cumulative /= cumulative[-1]
+            self.phase_quantile.append(buffer(np.array([np.interp(rank, c, x) for c in cumulative.T])))
+            self.phase_value.append(buffer(s.phase(np.cos(np.linspace(0.0, np.pi, 20_001))).T))
+
+    def densities(self, h: Float64) -> list[Float64]:
+        """Density of every species at altitudes."""
+        position = h / self.top * (DENSITY_NODES - 1)
+        return [lookup(table, position, DENSITY_NODES) for table in self.density]
+
+    def coefficient(self, tables: list[Float64], densities: list[Float64], w: UInt32) -> list[Float64]:
+        """Scattering or extinction coefficient of every species, 1/m."""
+        return [dr.gather(Float64, table, w) * d for table, d in zip(tables, densities, strict=True)]
+
+    def sunlight(self, h: Float64, mu_s: Float64, w: UInt32) -> Float64:
+        """Transmittance to the sun times the visible fraction of its disc."""
+        r = self.radius + h
+        horizon = -dr.sqrt(h * (2 * self.radius + h)) / r
+        half = max(self.twin.disc, 1e-12) * self.radius / r
+        x = dr.clip((mu_s - horizon + half) / (2 * half), 0.0, 1.0)
+        mu = dr.maximum(mu_s, horizon)
+        perigee = dr.maximum(r * dr.safe_sqrt(1 - mu * mu) - self.radius, 0.0)
+        own, low = self._rising(h, dr.abs(mu)), self._rising(perigee, Float64(0.0))
+        depth = Float64(0.0)
+        for table, up, down in zip(self.extinction, own, low, strict=True):
+            depth += dr.gather(Float64, table, w) * dr.select(mu < 0, dr.maximum(2 * down - up, up), up)
+        return x * x * (3 - 2 * x) * dr.exp(-depth)
+
+    def _rising(self, h: Float64, mu: Float64) -> list[Float64]:
+        n_h, n_mu = COLUMNS
+        y = dr.sqrt(dr.clip(h / self.top, 0.0, 1.0)) * (n_h - 1)
+        row = dr.minimum(UInt32(y), n_h - 2)
+        low, high = (self.top * (Float64(row + step) / (n_h - 1)) ** 2 for step in (0, 1))
+        f = (h - low) / (high - low)
+        x = dr.log(1 + mu / self.knee) / np.log1p(1 / self.knee) * (n_mu - 1)
+        return [dr.lerp(lookup(t, x, n_mu, row * n_mu), lookup(t, x, n_mu, (row + 1) * n_mu), f) for t in self.sun_columns]
+
+    def orders_from_two(self, views: Mapping[str, np.ndarray], paths: int, seed: int = 0, batch: int = 1 << 20):
+        """(mean, standard error) [N, W] of the radiance of all orders >= 2 for sunlight of irradiance 1."""
+        count = views["mu"].size * self.width
+        self._first_events(views)
+        per_batch = max(1, min(paths, batch // count))
+        totals = []
+        for index in range(max(8, -(-paths // per_batch))):
+            value = self._walk(views, per_batch, seed * 100_003 + index)
+            totals.append(np.array(dr.block_sum(value, per_batch)).reshape(-1, self.width) / per_batch)
+        totals = np.array(totals)
+        return totals.mean(axis=0), totals.std(axis=0, ddof=1) / np.sqrt(len(totals))
+
+    def _first_events(self, views: Mapping[str, np.ndarray]) -> None:
+        """Quantiles of the distance to the first event of each view ray and wavelength, and how probable one in the air is."""
+        twin = self.twin
+        h, mu = views["h"], views["mu"]
+        enter, leave = twin.limits(h, mu)
+        steps = 1500
+        x = (1 - np.cos(np.linspace(0, np.pi, steps + 1))) / 2  # dense at both ends: sinking rays meet their density there
+        perigee = np.clip(-(twin.radius + h) * mu, enter, leave)
+        quantiles = np.zeros((h.size, self.width, QUANTILES))
+        self.hits, inside = twin.hits_ground(h, mu), np.zeros((h.size, self.width))
+        for i in range(h.size):
+            d = np.unique(np.concatenate([enter[i] + (perigee[i] - enter[i]) * x, perigee[i] + (leave[i] - perigee[i]) * x]))
+            if d.size < 2:
+                continue
+            pieces = twin.optical_depth(twin.columns(np.full(d.size - 1, h[i]), np.full(d.size - 1, mu[i]), d[:-1], d[1:]))
+            depth = np.vstack([np.zeros(self.width), np.cumsum(pieces, axis=0)])
+            for w in range(self.width):
+                event = -np.expm1(-depth[:, w])
+                inside[i, w] = event[-1]
+                if event[-1] > 0:
+                    quantiles[i, w] = np.interp(np.linspace(0, event[-1], QUANTILES), event, d)
+        self.first_distance, self.first_probability = buffer(quantiles), buffer(inside)
+
+    def _walk(self, views: Mapping[str, np.ndarray], paths: int, seed: int) -> Float64:
+        n = views["mu"].size * self.width * paths
+        lane = dr.arange(UInt32, n)
+        task = lane // paths
+        view, w = task // self.width, task % self.width
+        rng = PCG32(size=n, initstate=seed + 1, initseq=dr.arange(dr.uint64_array_t(Float64), n))
+        h, mu, mu_s, nu = (dr.gather(Float64, buffer(views[k]), view) for k in ("h", "mu", "mu_s", "nu"))
+        hits = dr.gather(Float64, buffer(self.hits.astype(float)), view) > 0
+        # Cartesian, the observer on the z axis and the sun in the x-z plane, y >= 0 for the view: mirror symmetry.
+        sin_s = dr.safe_sqrt(1 - mu_s * mu_s)
+        vx = dr.select(sin_s > 1e-12, (nu - mu * mu_s) / dr.maximum(sin_s, 1e-12), dr.safe_sqrt(1 - mu * mu))
+        vy = dr.safe_sqrt(1 - mu * mu - vx * vx)
+        sun = (sin_s, Float64(0.0) * sin_s, mu_s)
+        direction = [vx, vy, mu]
+        probability = dr.gather(Float64, self.first_probability, task)
+        u = rng.next_float64()
+        ground = hits & (u >= probability)
+        weight = dr.select(hits, 1.0, probability)
+        rank = dr.select(hits, u, u * probability) / dr.maximum(probability, 1e-300) * (QUANTILES - 1)
+        distance = lookup(self.first_distance, rank, QUANTILES, task * QUANTILES)
+        r0 = self.radius + h
+        to_ground = -r0 * mu - dr.safe_sqrt(r0 * r0 * mu * mu - h * (2 * self.radius + h))
+        distance = dr.select(ground, to_ground, distance)
+        position = [distance * vx, distance * vy, dr.fma(distance, mu, r0)]
+        alive = weight > 0
+        total = Float64(0.0) * weight
+        event = UInt32(0) * lane
+
+        def step(alive, position, direction, weight, ground, event, total, rng):
+            r = dr.sqrt(sum(c * c for c in position))
+            h = dr.clip(r - self.radius, 0.0, self.top)
+            up = [c / r for c in position]
+            cos_sun = sum(a * b for a, b in zip(up, sun, strict=True))
+            nu = sum(a * b for a, b in zip(direction, sun, strict=True))
+            density = self.densities(h)
+            scattering = self.coefficient(self.scattering, density, w)
+            extinction = sum(self.coefficient(self.extinction, density, w))
+            scattered = sum(scattering)
+            albedo = dr.gather(Float64, self.albedo, w)
+            # The sun's light at this event, seen along the way that led here.
+            angle = dr.acos(dr.clip(nu, -1.0, 1.0)) / np.pi * 20_000
+            toward = Float64(0.0)
+            for k in range(self.count):
+                if self.phase_value[k] is not None:
+                    toward += scattering[k] * lookup(self.phase_value[k], angle, 20_001, w * 20_001)
+            toward = dr.select(ground, albedo / np.pi * dr.maximum(cos_sun, 0.0), toward / dr.maximum(extinction, 1e-300))
+            lit = self.sunlight(h, cos_sun, w)
+            total = total + dr.select(alive & (event > 0), weight * toward * lit, 0.0)
+            # A new direction: Lambertian from the ground, by the phase function of one species in the air.
+            weight = weight * dr.select(ground, albedo, scattered / dr.maximum(extinction, 1e-300))
+            pick, theta = rng.next_float64() * scattered, rng.next_float64()
+            turn = 2 * np.pi * rng.next_float64()
+            cosine, chosen = Float64(0.0), Bool(False)
+            for k in range(self.count):
+                if self.phase_value[k] is not None:
+                    mine = ~chosen & (pick <= scattering[k])
+                    bent = lookup(self.phase_quantile[k], theta * (QUANTILES - 1), QUANTILES, w * QUANTILES)
+                    cosine = dr.select(mine, dr.cos(bent), cosine)
+                    chosen = chosen | mine
+                    pick = pick - scattering[k]
+            axis = [dr.select(ground, a, b) for a, b in zip(up, direction, strict=True)]
+            cosine = dr.select(ground, dr.sqrt(theta), cosine)
+            direction = _turned(axis, cosine, turn)
+            event = event + 1
+            survive = dr.select(event > ROULETTE_FROM, dr.clip(weight, 0.05, 1.0), 1.0)
+            alive = alive & (weight > 0) & (rng.next_float64() < survive) & (event < MOST_EVENTS)
+            weight = weight / survive
+            position = [dr.select(ground, c * (self.radius / r), c) for c in position]
+            position, ground, alive = self._fly(position, direction, alive, ground, w, rng)
+            return alive, position, direction, weight, ground, event, total, rng
+
+        state = (alive, position, direction, weight, ground, event, total, rng)
+        result = dr.while_loop(state, lambda alive, *_: alive, step, label="walk")
+        dr.eval(result[6])
+        return result[6]
+
+    def _fly(self, position, direction, alive, from_ground, w, rng):
+        """Delta tracking to the next event: (position, on the ground, still inside)."""
+        r0 = dr.sqrt(sum(c * c for c in position))
+        h0 = dr.select(from_ground, 0.0, dr.clip(r0 - self.radius, 0.0, self.top))
+        mu0 = sum(a * b for a, b in zip(position, direction, strict=True)) / r0
+        r0 = self.radius + h0
+
+        def altitude(d):
+            change = d * dr.fma(2 * r0, mu0, d)
+            return h0 + change / (r0 + dr.safe_sqrt(dr.fma(r0, r0, change)))
+
+        def crossing(level, sign):
+            q = (level - h0) * (2 * self.radius + h0 + level)
+            return -r0 * mu0 + sign * dr.safe_sqrt(r0 * r0 * mu0 * mu0 + q)
+
+        perigee = -r0 * mu0
+        lowest = r0 * dr.safe_sqrt(1 - mu0 * mu0) - self.radius
+        meets = (mu0 < 0) & (lowest <= 0)
+        end = dr.select(meets, crossing(Float64(0.0), -1), crossing(Float64(self.top), 1))
+        d = Float64(0.0) * r0
+        collided = Bool(False) & alive
+        busy = alive & True
+
+        def step(busy, d, collided, rng):
+            h = dr.clip(altitude(d), 0.0, self.top)
+            falling = d < perigee
+            shell = dr.minimum(UInt32((h / self.top) ** (2 / 3) * SHELLS), SHELLS - 1)
+            shell = shell - dr.select((dr.gather(Float64, self.levels, shell) > h) & (shell > 0), UInt32(1), UInt32(0))
+            low, high = dr.gather(Float64, self.levels, shell), dr.gather(Float64, self.levels, shell + 1)
+            into = dr.select(lowest < low, crossing(low, -1), perigee)
+            edge = dr.maximum(dr.select(falling, into, crossing(high, 1)), d) + 1e-3
+            majorant = dr.gather(Float64, self.majorant, w * SHELLS + shell)
+            # The millimetre past the edge may touch the neighbour: its majorant differs by less than the margin below.
+            free = d - dr.log(1 - rng.next_float64()) / majorant
+            reached = free < edge
+            there = dr.clip(altitude(free), 0.0, self.top)
+            extinction = sum(self.coefficient(self.extinction, self.densities(there), w))
+            hit = reached & (free < end) & (rng.next_float64() * majorant < extinction)
+            d = dr.minimum(dr.select(reached, free, edge), end)
+            return busy & ~hit & (d < end), d, collided | (busy & hit), rng
+
+        _, d, collided, _ = dr.while_loop((busy, d, collided, rng), lambda busy, *_: busy, step, label="fly")
+        on_ground = alive & ~collided & meets
+        position = [dr.fma(d, b, a) for a, b in zip(position, direction, strict=True)]
+        return position, on_ground, alive & (collided | on_ground)
+
+
+def _turned(axis: list[Float64], cosine: Float64, turn: Float64) -> list[Float64]:
+    """Unit vectors at the angle with ``cosine`` from ``axis``, turned about it by ``turn``."""
+    x, y, z = axis
+    sign = dr.copysign(Float64(1.0), z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    sine = dr.safe_sqrt(1 - cosine * cosine)
+    u, v = sine * dr.cos(turn), sine * dr.sin(turn)
+    return [
+        u * (1 + sign * x * x * a) + v * b + cosine * x,
+        u * sign * b + v * (sign + y * y * a) + cosine * y,
+        -u * sign * x - v * y + cosine * z,
+    ]
+
+
+def truth(spec: Mapping, views: Mapping[str, np.ndarray], paths: int = 100_000, seed: int = 0):
+    """(radiance, standard error) [N, W] of an atmosphere given as contract JSON, all orders and the ground's own light."""
+    twins = load_twins()
+    twin = twins.Twin(spec)
+    columns = {k: np.atleast_1d(np.asarray(v, float)) for k, v in views.items()}
+    mu, mu_s, nu = twins.cosines(*(columns[f"{k}_deg"] for k in ("sun_zenith", "view_zenith", "azimuth")))
+    h = columns["altitude_m"] + 0 * mu
+    exact = twin.single_scattering(h, mu, mu_s, nu) + twin.ground_direct(h, mu, mu_s, nu)
+    mean, sigma = MonteCarlo(twin).orders_from_two({"h": h, "mu": mu, "mu_s": mu_s, "nu": nu}, paths, seed)
+    return exact + twin.solar * mean, twin.solar * sigma
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m bench.monte_carlo", description=__doc__.splitlines()[0])
+    parser.add_argument("--atmosphere", type=Path, required=True, help="contract JSON")
+    parser.add_argument("--views", type=Path, required=True, help="views as for atmo-jit sky (no distance_m)")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--paths", type=int, default=100_000, help="paths per view and wavelength")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    with np.load(options.views) as file:
+        views = dict(file)
+    radiance, sigma = truth(json.loads(options.atmosphere.read_text(encoding="utf-8")), views, options.paths, options.seed)
+    np.savez(options.out, radiance=radiance, sigma=sigma)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
