@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from .grid import Grid
-from .quadrature import facing_up, split_directions
+from .quadrature import split_directions
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), and ``facing_up`` [K, D], weights of the irradiance."""
+    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), ``facing_up`` [K, D]: those of the irradiance."""
 
     mu: np.ndarray
     weight: np.ndarray
@@ -28,9 +28,7 @@ class Directions:
         """Gauss-Legendre directions split at each altitude's own horizon."""
         r = grid.radius_m + grid.h
         horizon = -np.sqrt(grid.h * (2.0 * grid.radius_m + grid.h)) / r
-        mu, weight = zip(*(split_directions(m, up, down) for m in horizon), strict=True)
-        facing = [np.concatenate([facing_up(m, up), np.zeros(down)]) for m in horizon]
-        return cls(np.array(mu), np.array(weight), np.array(facing))
+        return cls(*(np.array(rows) for rows in zip(*(split_directions(m, up, down) for m in horizon), strict=True)))
 
 
 @dataclass(frozen=True)

@@ -50,8 +50,8 @@ class Resolution:
         fine = tolerance < 0.005
         return cls(
             altitudes=16 if fine else 12,
-            up=max(6, later // 2 + 4),
-            down=max(4, later // 3 + 3),
+            up=max(6, later // 2 + 5),
+            down=max(4, later // 3 + 4),
             azimuths=max(later, first // 2) + 2,
             degree=later,
             first_up=max(10, first // 2 + 4),

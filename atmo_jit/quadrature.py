@@ -7,6 +7,9 @@ from functools import lru_cache
 import numpy as np
 
 
+LOW_HORIZON = -0.07  # cosine of the horizon from where the air above is thin: 16 km over the earth
+
+
 @lru_cache(maxsize=64)
 def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes x [count] and weights w [count] with sum(w f(x)) = integral of f over [0, 1], exact to degree 2 count - 1."""
@@ -27,32 +30,35 @@ def running_integral(count: int, at: tuple[float, ...]) -> np.ndarray:
     return antiderivative @ np.linalg.inv(vandermonde)
 
 
-def split_directions(horizon_mu: float, count_up: int, count_down: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines mu [count_up + count_down] and weights over [-1, 1], split at ``horizon_mu`` and clustered to it (x^2 on both sides).
+def split_directions(horizon_mu: float, count_up: int, count_down: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines mu and weights over [-1, 1], split at ``horizon_mu`` and clustered to it (x^2), and weights of mu over [0, 1].
 
-    Radiance jumps at the horizon: a rule that straddles it loses up to 15 % of the source at low sun. Weights sum to 2.
+    Radiance jumps at the horizon: a rule that straddles it loses up to 15 % of the source at low sun. High up, the bright band between the
+    horizon and mu = 0 gets a rule of its own. Lower down a horizontal surface stops seeing in the middle of the upper rule, and its
+    weights integrate the polynomial through that rule's nodes from mu = 0 on. All three are [count_up + count_down].
     """
-    x_up, w_up = gauss_legendre(count_up)
-    x_down, w_down = gauss_legendre(count_down)
-    up, down = 1.0 - horizon_mu, horizon_mu + 1.0
-    mu = np.concatenate([horizon_mu + up * x_up**2, horizon_mu - down * x_down**2])
-    weight = np.concatenate([up * 2.0 * x_up * w_up, down * 2.0 * x_down * w_down])
-    return mu, weight
+    band = max(2, round(0.35 * count_up)) if horizon_mu < LOW_HORIZON else 0
+    panels = [(horizon_mu, 0.0, band), (0.0, 1.0, count_up - band)] if band else [(horizon_mu, 1.0, count_up)]
+    mu, weight, facing_up = [], [], []
+    for start, end, count in [(horizon_mu, -1.0, count_down), *panels]:
+        x, w = gauss_legendre(count)
+        mu.append(start + (end - start) * x**2)
+        weight.append(abs(end - start) * 2.0 * x * w)
+        facing_up.append(np.maximum(mu[-1], 0.0) * weight[-1])
+    if not band:
+        facing_up[1] = _partial_weights(horizon_mu, count_up)
+    return np.concatenate(mu), np.concatenate(weight), np.concatenate(facing_up)
 
 
-def facing_up(horizon_mu: float, count_up: int) -> np.ndarray:
-    """Weights [count_up] on the directions above the horizon of split_directions: integral of mu f(mu) over mu in [0, 1].
-
-    Aloft the horizon lies below mu = 0, where a horizontal surface stops seeing: the weights integrate the polynomial through the nodes from
-    there on. At the ground they are mu times the usual ones.
-    """
-    x, _ = gauss_legendre(count_up)
+def _partial_weights(horizon_mu: float, count: int) -> np.ndarray:
+    """Weights on mu = horizon + (1 - horizon) x^2 at the Gauss nodes x: integral of mu f(mu) from mu = 0 to 1."""
+    x, _ = gauss_legendre(count)
     span = 1.0 - horizon_mu
     start = np.sqrt(-horizon_mu / span)
-    at, weight = gauss_legendre(count_up + 2)
+    at, weight = gauss_legendre(count + 2)
     at, weight = start + (1.0 - start) * at, (1.0 - start) * weight
-    basis = np.array([np.prod([(at - x[j]) / (x[i] - x[j]) for j in range(count_up) if j != i], axis=0) for i in range(count_up)])
-    return basis @ (weight * (horizon_mu + span * at**2) * span * 2.0 * at)
+    basis = [np.prod([(at - x[j]) / (x[i] - x[j]) for j in range(count) if j != i], axis=0) for i in range(count)]
+    return np.array(basis) @ (weight * (horizon_mu + span * at**2) * span * 2.0 * at)
 
 
 def half_circle(count: int) -> np.ndarray:

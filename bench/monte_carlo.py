@@ -70,10 +70,10 @@ class MonteCarlo:
         self.extinction = [buffer(s.extinction) for s in species]
         levels = self.top * (np.arange(SHELLS + 1) / SHELLS) ** 1.5
         shell = np.clip(np.searchsorted(levels, h, side="right") - 1, 0, SHELLS - 1)
-        total = np.array([[sum(s.extinction[w] * d for s, d in zip(species, density, strict=True))] for w in range(self.width)])
+        total = np.array([s.extinction for s in species]).T @ density
         largest = np.zeros((self.width, SHELLS))
         for offset in (-1, 0, 1):  # a shell's majorant holds for interpolation across its edges too
-            np.maximum.at(largest.T, np.clip(np.roll(shell, offset), 0, SHELLS - 1), total[:, 0].T)
+            np.maximum.at(largest.T, np.roll(shell, offset), total.T)
         self.majorant, self.levels = buffer(largest * 1.0001 + 1e-30), buffer(levels)
         self._tabulate_columns()
         self._tabulate_phases()
@@ -134,19 +134,25 @@ class MonteCarlo:
         low, high = (self.top * (Float64(row + step) / (n_h - 1)) ** 2 for step in (0, 1))
         f = (h - low) / (high - low)
         x = dr.log(1 + mu / self.knee) / np.log1p(1 / self.knee) * (n_mu - 1)
-        return [dr.lerp(lookup(t, x, n_mu, row * n_mu), lookup(t, x, n_mu, (row + 1) * n_mu), f) for t in self.sun_columns]
+        return [
+            dr.lerp(lookup(t, x, n_mu, row * n_mu), lookup(t, x, n_mu, (row + 1) * n_mu), f) for t in self.sun_columns
+        ]
 
     def orders_from_two(self, views: Mapping[str, np.ndarray], paths: int, seed: int = 0, batch: int = 1 << 20):
         """(mean, standard error) [N, W] of the radiance of all orders >= 2 for sunlight of irradiance 1."""
         count = views["mu"].size * self.width
         self._first_events(views)
         per_batch = max(1, min(paths, batch // count))
-        totals = []
-        for index in range(max(8, -(-paths // per_batch))):
+        batches = -(-paths // per_batch)
+        total = square = 0.0
+        for index in range(batches):
             value = self._walk(views, per_batch, seed * 100_003 + index)
-            totals.append(np.array(dr.block_sum(value, per_batch)).reshape(-1, self.width) / per_batch)
-        totals = np.array(totals)
-        return totals.mean(axis=0), totals.std(axis=0, ddof=1) / np.sqrt(len(totals))
+            total = total + np.array(dr.block_sum(value, per_batch))
+            square = square + np.array(dr.block_sum(value * value, per_batch))
+        size = batches * per_batch
+        mean = total / size
+        error = np.sqrt(np.maximum(square / size - mean**2, 0.0) / size)
+        return mean.reshape(-1, self.width), error.reshape(-1, self.width)
 
     def _first_events(self, views: Mapping[str, np.ndarray]) -> None:
         """Quantiles of the distance to the first event of each view ray and wavelength, and how probable one in the air is."""
@@ -154,15 +160,21 @@ class MonteCarlo:
         h, mu = views["h"], views["mu"]
         enter, leave = twin.limits(h, mu)
         steps = 1500
-        x = (1 - np.cos(np.linspace(0, np.pi, steps + 1))) / 2  # dense at both ends: sinking rays meet their density there
+        x = (
+            1 - np.cos(np.linspace(0, np.pi, steps + 1))
+        ) / 2  # dense at both ends: sinking rays meet their density there
         perigee = np.clip(-(twin.radius + h) * mu, enter, leave)
         quantiles = np.zeros((h.size, self.width, QUANTILES))
         self.hits, inside = twin.hits_ground(h, mu), np.zeros((h.size, self.width))
         for i in range(h.size):
-            d = np.unique(np.concatenate([enter[i] + (perigee[i] - enter[i]) * x, perigee[i] + (leave[i] - perigee[i]) * x]))
+            d = np.unique(
+                np.concatenate([enter[i] + (perigee[i] - enter[i]) * x, perigee[i] + (leave[i] - perigee[i]) * x])
+            )
             if d.size < 2:
                 continue
-            pieces = twin.optical_depth(twin.columns(np.full(d.size - 1, h[i]), np.full(d.size - 1, mu[i]), d[:-1], d[1:]))
+            pieces = twin.optical_depth(
+                twin.columns(np.full(d.size - 1, h[i]), np.full(d.size - 1, mu[i]), d[:-1], d[1:])
+            )
             depth = np.vstack([np.zeros(self.width), np.cumsum(pieces, axis=0)])
             for w in range(self.width):
                 event = -np.expm1(-depth[:, w])
@@ -216,7 +228,9 @@ class MonteCarlo:
             for k in range(self.count):
                 if self.phase_value[k] is not None:
                     toward += scattering[k] * lookup(self.phase_value[k], angle, 20_001, w * 20_001)
-            toward = dr.select(ground, albedo / np.pi * dr.maximum(cos_sun, 0.0), toward / dr.maximum(extinction, 1e-300))
+            toward = dr.select(
+                ground, albedo / np.pi * dr.maximum(cos_sun, 0.0), toward / dr.maximum(extinction, 1e-300)
+            )
             lit = self.sunlight(h, cos_sun, w)
             total = total + dr.select(alive & (event > 0), weight * toward * lit, 0.0)
             # A new direction: Lambertian from the ground, by the phase function of one species in the air.
@@ -332,7 +346,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     with np.load(options.views) as file:
         views = dict(file)
-    radiance, sigma = truth(json.loads(options.atmosphere.read_text(encoding="utf-8")), views, options.paths, options.seed)
+    radiance, sigma = truth(
+        json.loads(options.atmosphere.read_text(encoding="utf-8")), views, options.paths, options.seed
+    )
     np.savez(options.out, radiance=radiance, sigma=sigma)
     return 0
 

@@ -257,7 +257,7 @@ loaded; in scalar variants call ``emitter.set_scene(scene)`` first.
         sun = self._disc.mean * self._atmosphere.solar_irradiance
         luminance = float(SpectralBasis.of(self._atmosphere).xyz_matrix[1] @ sun)
         scales = [float(_host(self._values[name])[0]) for name in ("sun_scale", "sky_scale")]
-        share = sun_share(max(luminance, 0.0) * scales[0], self._lookup.flux * scales[1])
+        share = sun_share(max(luminance, 0.0) * scales[0], self._lookup.flux * scales[1], math.cos(self._view.sun_zenith))
         self._share, self._rest = number(share), number(1.0 - share)
         self._share_inverse, self._rest_inverse = number(1.0 / max(share, 1e-9)), number(1.0 / max(1.0 - share, 1e-9))
 

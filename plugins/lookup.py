@@ -20,6 +20,7 @@ ROWS = ROWS_DOWN + ROWS_UP
 # find it by sampling their BSDF, since it has no small bright features.
 HORIZON_IMPORTANCE = 0.5
 GROUND_SHARE = 0.02
+LOW_SUN_IMPORTANCE = 0.25
 # Share of the sky's samples that is spread evenly, so that no direction has density 0 (night, black sky seen from space).
 EVEN_SHARE = 0.005
 
@@ -159,6 +160,10 @@ class SunLookup:
         return mi.Frame3f(sun).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, dr.fma(-2.0 * s, s, 1.0)))
 
 
-def sun_share(sun: float, sky: float) -> float:
-    """Probability of sampling the sun, given the luminous flux of sun and sky; 0 without a sun."""
-    return sun / (sun + sky) if sun > 0.0 else 0.0
+def sun_share(sun: float, sky: float, sine: float) -> float:
+    """Probability of sampling the sun, given the luminous irradiance across its beam, the sky's flux and the sine of its elevation.
+
+    A low sun counts for less: surfaces that face it have noise to spare, the ground does not. 0 without a sun.
+    """
+    weight = sun * (LOW_SUN_IMPORTANCE + (1.0 - LOW_SUN_IMPORTANCE) * max(sine, 0.0))
+    return weight / (weight + sky) if weight > 0.0 else 0.0
