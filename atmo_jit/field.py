@@ -38,9 +38,13 @@ class Field:
         self.degree = light.degree
         self.moments, self.reflected = refine.both(light.moments), refine.both(self._per_depth(light.sky))
         chi = [optics.phase_moments(k, self.degree) for k in optics.scatterers]
-        self._chi = _interleave([[chi[i][c] for c in range(optics.channel_count)] for i in range(len(chi))], self.degree)
+        self._chi = _interleave(
+            [[chi[i][c] for c in range(optics.channel_count)] for i in range(len(chi))], self.degree
+        )
         l_, m = pairs(self.degree)
-        self._recurrence = floats([[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)])
+        self._recurrence = floats(
+            [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+        )
         self._l = floats(l_)
 
     def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
@@ -60,10 +64,16 @@ class Field:
         t, size = types(), padded(self.optics.channel_count)
         altitudes, suns = self.grid.shape
         above = self._depth_above(floats(self.grid.h))
-        per_altitude = stored([dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above], dr.arange(t.UInt, altitudes), size)
+        per_altitude = stored(
+            [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above],
+            dr.arange(t.UInt, altitudes),
+            size,
+        )
         lane = dr.arange(t.UInt, altitudes * suns * size)
         below_top = dr.select(lane >= (altitudes - 1) * suns * size, lane - suns * size, lane)
-        return dr.gather(t.Float, irradiance, below_top) * dr.gather(t.Float, per_altitude, below_top // (suns * size) * size + lane % size)
+        return dr.gather(t.Float, irradiance, below_top) * dr.gather(
+            t.Float, per_altitude, below_top // (suns * size) * size + lane % size
+        )
 
     def _depth_above(self, h: Any) -> list[Any]:
         return self.optics.scattering_depths(self.columns.toward(h, types().Float(1.0)))
@@ -80,7 +90,8 @@ class Field:
         values = [packet(self.reflected if reflected else self.sky, node, size, active) for node in nodes]
         above = self._depth_above(h)
         return [
-            dr.maximum(_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in values]), 0.0) * above[c]
+            dr.maximum(_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in values]), 0.0)
+            * above[c]
             for c in channels
         ]
 
@@ -94,7 +105,9 @@ class Field:
         count = pair_count(self.degree)
         stride = dr.opaque(t.UInt, count, 1)
 
-        def pair(i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]) -> tuple[Any, ...]:
+        def pair(
+            i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]
+        ) -> tuple[Any, ...]:
             a, b, start, is_diagonal = packet(self._recurrence, i, 4, active)
             new_m = start > 0.0
             diagonal = dr.select(new_m, diagonal * sine * start, diagonal)
@@ -104,16 +117,30 @@ class Field:
             before = dr.select(is_diagonal > 0.0, 0.0, last)
             basis = value * next_cos
             corner = [packet(self.moments, node * stride + i, size, active) for node in nodes]
-            moment = [_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis for c in range(channels)]
+            moment = [
+                _blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis
+                for c in range(channels)
+            ]
             degree = t.UInt(dr.gather(t.Float, self._l, i, active))
             chi = packet(self._chi, degree, kinds * size, active)
-            sums = [dr.fma(chi[n], moment[n % size], sums[n]) if n % size < channels else sums[n] for n in range(kinds * size)]
+            sums = [
+                dr.fma(chi[n], moment[n % size], sums[n]) if n % size < channels else sums[n]
+                for n in range(kinds * size)
+            ]
             return i + 1, diagonal, value, before, next_cos, cos_m1, sums
 
         width = dr.width(h)
         zero, one = dr.zeros(t.Float, width), dr.full(t.Float, 1.0, width)
         # cos(0 phi) = 1, and cos(-1 phi) = cos phi starts the recurrence cos((m + 1) phi) = 2 cos phi cos(m phi) - cos((m - 1) phi).
-        state = (t.UInt(0), one * 0.28209479, zero, zero, one, cos_phi + zero, [dr.zeros(t.Float, width) for _ in range(kinds * size)])
+        state = (
+            t.UInt(0),
+            one * 0.28209479,
+            zero,
+            zero,
+            one,
+            cos_phi + zero,
+            [dr.zeros(t.Float, width) for _ in range(kinds * size)],
+        )
         *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
         return [[dr.maximum(sums[n * size + c], 0.0) for c in range(channels)] for n in range(kinds)]
 

@@ -13,13 +13,14 @@ import drjit as dr
 import numpy as np
 
 from .backend import floats, packet, padded, stored, types, uints
-from .geometry import altitude_along, safe_sine
+from .geometry import safe_sine
 from .grid import Grid
 from .harmonics import legendre, pair_count
-from .march import FEW, MAX_DEPTH, SPENT_DEPTH, relative_azimuth
+from .march import relative_azimuth
 from .optics import Optics
+from .path_weights import PathWeights
 from .paths import Directions, Paths
-from .quadrature import gauss_legendre, half_circle, running_integral
+from .quadrature import half_circle
 from .refinement import Order, Refinement
 
 
@@ -28,10 +29,10 @@ class Gather:
 
     def __init__(self, optics: Optics, grid: Grid, directions: Directions, azimuths: int) -> None:
         self.optics, self.grid, self.directions, self.azimuths = optics, grid, directions, azimuths
-        self.paths = Paths.trace(grid, directions)
+        self.paths = Paths.trace(grid, directions, grid.refine)
+        self._weights = PathWeights(optics, self.paths)
         self.size = padded(optics.channel_count)
         self._place_samples()
-        self._weigh()
 
     def _place_samples(self) -> None:
         """Sun coordinate and azimuth cosine at every visit, sun node and azimuth: they serve every order."""
@@ -41,7 +42,10 @@ class Gather:
         azimuth, rest = lane % azimuths, lane // azimuths
         sun, visit = rest % suns, rest // suns
         cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
-        mu_s, sin_s = dr.gather(t.Float, floats(np.cos(grid.theta)), sun), dr.gather(t.Float, floats(np.sin(grid.theta)), sun)
+        mu_s, sin_s = (
+            dr.gather(t.Float, floats(np.cos(grid.theta)), sun),
+            dr.gather(t.Float, floats(np.sin(grid.theta)), sun),
+        )
         mu0, mu, cos_turn, sin_turn = (
             dr.gather(t.Float, floats(a[p.station]), visit) for a in (p.mu_start[p.ray], p.mu, p.cos_turn, p.sin_turn)
         )
@@ -51,91 +55,13 @@ class Gather:
         self._cos_phi = relative_azimuth(mu, turned, nu)
         dr.eval(self._sun, self._cos_phi)
 
-    def _weigh(self) -> None:
-        """Scattering weights of every visit per scatterer and channel, and the light that the ground sends back from a path's end.
-
-        Between two stations the field is linear in the altitude coordinate u; each station gets its hat function's share of the integral
-        of density times transmittance over both pieces beside it.
-        """
-        t, p, optics = types(), self.paths, self.optics
-        kinds, channels, size = len(optics.constituents), optics.channel_count, self.size
-        node = dr.arange(t.UInt, p.count)
-        ray = uints(p.ray)
-        follows = uints(np.append(p.ray[1:] == p.ray[:-1], False))
-        distance, u = floats(p.distance), floats(p.u)
-        h, mu = dr.gather(t.Float, floats(p.h), ray), dr.gather(t.Float, floats(p.mu_start), ray)
-        nxt = dr.minimum(node + 1, dr.opaque(t.UInt, p.count - 1, 1))
-        start, stop = distance, dr.select(follows == 1, dr.gather(t.Float, distance, nxt), distance)
-        u_start, u_stop = u, dr.gather(t.Float, u, nxt)
-        x, w = (a.tolist() for a in gauss_legendre(FEW))
-        running = running_integral(FEW, tuple(x)).tolist()
-
-        own = [dr.zeros(t.Float, p.count) for _ in range(kinds)]
-        for node_x, weight in zip(x, w, strict=True):
-            there, _ = altitude_along(optics.radius, h, mu, dr.fma(stop - start, node_x, start))
-            for k, density in enumerate(optics.densities(there)):
-                own[k] = dr.fma((stop - start) * weight, density, own[k])
-        first = dr.gather(t.UInt, uints(p.first), ray)
-        dr.eval(own)
-
-        def add_piece(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            return i + 1, [s + dr.gather(t.Float, o, i) for s, o in zip(sums, own, strict=True)]
-
-        zeros = [dr.zeros(t.Float, p.count) for _ in range(kinds)]
-        _, before = dr.while_loop((first + 0, zeros), lambda i, _: i < node, add_piece, label="columns")
-
-        def advance(d: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> tuple[Any, ...]:
-            here, _ = altitude_along(optics.radius, h, mu, d)
-            there, _ = altitude_along(optics.radius, h, mu, stop)
-            densest = dr.maximum(optics.largest_extinction(optics.densities(here)), optics.largest_extinction(optics.densities(there)))
-            length = dr.minimum(stop - d, MAX_DEPTH / dr.maximum(densest, 1e-30))
-            points = [altitude_along(optics.radius, h, mu, dr.fma(length, node_x, d))[0] for node_x in x]
-            density = [optics.densities(point) for point in points]
-            for g in range(FEW):
-                inside = [dr.fma(length, sum(running[g][i] * density[i][k] for i in range(FEW)), amounts[k]) for k in range(kinds)]
-                seen = [dr.exp(-depth) * (length * w[g]) for depth in optics.optical_depths(inside)]
-                k_index, fraction = self.grid.locate_altitude(points[g])
-                position = t.Float(k_index) + fraction
-                hat = dr.clip((position - u_start) / (u_stop - u_start), 0.0, 1.0)
-                hat = dr.select(u_stop == u_start, 0.5, hat)
-                for n, k in enumerate(optics.scatterers):
-                    for c in range(channels):
-                        share = optics.scattering[k][c] * density[g][k] * seen[c]
-                        i = n * channels + c
-                        near[i] = dr.fma(share, 1.0 - hat, near[i])
-                        far[i] = dr.fma(share, hat, far[i])
-            for k in range(kinds):
-                amounts[k] = dr.fma(length, sum(w[g] * density[g][k] for g in range(FEW)), amounts[k])
-            done = length >= stop - d
-            return dr.select(done, stop, d + length), amounts, near, far
-
-        def unfinished(d: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> Any:
-            depths = optics.optical_depths(amounts)
-            thinnest = depths[0]
-            for depth in depths[1:]:
-                thinnest = dr.minimum(thinnest, depth)
-            return (d < stop) & (thinnest < SPENT_DEPTH)
-
-        many = len(optics.scatterers) * channels
-        state = (start + 0.0, [b + 0.0 for b in before], *([dr.zeros(t.Float, p.count) for _ in range(many)] for _ in range(2)))
-        _, _, near, far = dr.while_loop(state, unfinished, advance, label="weights")
-        dr.eval(near, far)
-        has_previous = node > first
-        previous = dr.maximum(node, 1) - 1
-        weights = [n + dr.gather(t.Float, f, previous, has_previous) for n, f in zip(near, far, strict=True)]
-        station, factor = uints(p.station), floats(p.factor)
-        self._weights = [dr.gather(t.Float, weight, station) * factor for weight in weights]
-        last = np.append(p.ray[1:] != p.ray[:-1], True) & p.ground[p.ray]
-        on_ground = floats(last)
-        reflected = [dr.exp(-depth) * on_ground * albedo * dr.inv_pi for depth, albedo in zip(optics.optical_depths(before), optics.albedo, strict=True)]
-        self._reflected = [dr.gather(t.Float, value, station) for value in reflected]
-        dr.eval(self._weights, self._reflected)
-
     def __call__(self, refine: Refinement, light: Order) -> Any:
         """Radiance at the solved nodes, [K, D, S, azimuths, size], of ``light`` after one more event."""
         t, p, size, channels = types(), self.paths, self.size, self.optics.channel_count
         suns, sources, azimuths, orders = self.grid.shape[1], self.grid.sources, self.azimuths, light.degree + 1
-        contracted = refine.suns(self._contract(refine.altitudes(light.moments), light.sky, light.degree), len(p.station))
+        contracted = refine.suns(
+            self._contract(refine.altitudes(light.moments), light.sky, light.degree), len(p.station)
+        )
         per_visit = suns * azimuths
         lane = dr.arange(t.UInt, len(p.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
@@ -178,7 +104,7 @@ class Gather:
         products = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
         for n in range(len(chi)):
             for c in range(channels):
-                weight = dr.gather(t.Float, self._weights[n * channels + c], visit)
+                weight = dr.gather(t.Float, self._weights.weights[n * channels + c], visit)
                 products[c] = dr.fma(weight, dr.gather(t.Float, chi[n][c], l_), products[c])
         weights = stored(products, lane, size)
 
@@ -200,4 +126,8 @@ class Gather:
         _, sums = dr.while_loop((m + 0, zero), lambda l_, _: l_ < end, add, label="contract")
         # The ground scatters into every direction alike: it joins m = 0 at the visit where a path ends on it.
         light = packet(sky, sun, size, m == 0)
-        return stored([dr.fma(dr.gather(t.Float, self._reflected[c], visit, m == 0), light[c], sums[c]) for c in range(channels)], lane, size)
+        return stored(
+            [dr.fma(dr.gather(t.Float, self._weights.reflected[c], visit, m == 0), light[c], sums[c]) for c in range(channels)],
+            lane,
+            size,
+        )

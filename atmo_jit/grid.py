@@ -45,12 +45,16 @@ class Grid:
             if step.sum() > 0:
                 rise = rise + step / step.sum()
         u = np.concatenate([[0.0], np.cumsum(rise)])
-        u *= refine * (count - 1) / u[-1]
-        self.levels = np.interp(np.arange(refine * (count - 1) + 1), u, h)
-        self.levels[0], self.levels[-1] = 0.0, atmosphere.thickness_m
-        self.h = self.levels[::refine]
-        self._u = u
+        self._u, self._h_of_u, self.refine = u * ((count - 1) / u[-1]), h, refine
+        self.h, self.levels = self.levels_at(1), self.levels_at(refine)
         self.altitude_refinement = _cubic_refinement(count, refine, even=False)
+
+    def levels_at(self, refine: int) -> np.ndarray:
+        """Altitudes (m) at ``refine`` equal steps of u per interval of the solved ones, ascending from 0 to the top."""
+        count = round(self._u[-1])
+        levels = np.interp(np.arange(refine * count + 1) / refine, self._u, self._h_of_u)
+        levels[0], levels[-1] = 0.0, self.thickness_m
+        return levels
 
     def _place_suns(self, count: int, refine: int) -> None:
         # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for multiple.
@@ -75,7 +79,7 @@ class Grid:
         return len(self.h), len(self.theta)
 
     def u_of(self, h: np.ndarray) -> np.ndarray:
-        """Altitude coordinate, j at refined level j (float64)."""
+        """Altitude coordinate, k at solved altitude k (float64)."""
         return np.interp(self._position(np.asarray(h)), np.arange(_FINE + 1), self._u)
 
     def _position(self, h: np.ndarray) -> np.ndarray:
@@ -85,13 +89,14 @@ class Grid:
     def _u_buffer(self) -> Any:
         return floats(self._u)
 
-    def locate_altitude(self, h: Any) -> tuple[Any, Any]:
+    def locate_altitude(self, h: Any, refine: int | None = None) -> tuple[Any, Any]:
         """Index of the refined level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
-        position = dr.cbrt(dr.clip(h / parameter(self.thickness_m), 0.0, 1.0)) * _FINE
+        refine = self.refine if refine is None else refine
+        position = dr.cbrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return _split(dr.lerp(u0, u1, position - t.Float(cell)), len(self.levels))
+        return _split(float(refine) * dr.lerp(u0, u1, position - t.Float(cell)), refine * (self.shape[0] - 1) + 1)
 
     def sun_position(self, mu_s: Any) -> Any:
         """Sun coordinate x of cos(sun zenith) ``mu_s``, in units of the refined nodes, clipped to the last."""

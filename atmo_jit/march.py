@@ -60,7 +60,9 @@ class Source(Protocol):
 def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
     """Rays from ``h`` to whatever they meet first, the ground or the top."""
     ground = hits_ground(optics.radius, h, mu)
-    stop = dr.select(ground, distance_down(optics.radius, h, mu, 0.0), distance_up(optics.radius, h, mu, optics.thickness))
+    stop = dr.select(
+        ground, distance_down(optics.radius, h, mu, 0.0), distance_up(optics.radius, h, mu, optics.thickness)
+    )
     return Rays(h, mu, mu_s, nu, stop, ground)
 
 
@@ -101,7 +103,12 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
         discriminant = dr.fma(b, b, -a * c)
         q = -b - dr.copysign(dr.safe_sqrt(discriminant), b)
         for distance in (c / q, q / a):
-            counts = (discriminant > 0.0) & dr.isfinite(distance) & (distance > 0.0) & (dr.fma(distance, rays.nu, axial) < 0.0)
+            counts = (
+                (discriminant > 0.0)
+                & dr.isfinite(distance)
+                & (distance > 0.0)
+                & (dr.fma(distance, rays.nu, axial) < 0.0)
+            )
             edges.append(dr.select(counts, distance, never))
     return edges
 
@@ -164,7 +171,9 @@ def march(
     edges = _sunlight_edges(optics, rays) if single else []
     rule = Rule(nodes)
     phases = {
-        k: optics.phase_values(k, rays.nu) if phase_degree is None else optics.smoothed_phase_values(k, rays.nu, phase_degree)
+        k: optics.phase_values(k, rays.nu)
+        if phase_degree is None
+        else optics.smoothed_phase_values(k, rays.nu, phase_degree)
         for k in optics.scatterers
     }
 
@@ -187,7 +196,10 @@ def march(
             end = dr.select(edge > d, dr.minimum(end, edge), end)
         length = end - d
 
-        density = [optics.densities(altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, x, d))[0]) for x in rule.few_x]
+        density = [
+            optics.densities(altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, x, d))[0])
+            for x in rule.few_x
+        ]
 
         def node(g: Any, one: list[Any], weight: list[Any], centroid: Any, total: Any) -> tuple[Any, ...]:
             x, w, *running = rule.at(g)

@@ -26,7 +26,9 @@ from .single_scattering import first_order
 STEADIEST_RATIO = 0.97  # of successive orders: a white world under a conservative sky loses at least this little
 
 
-def solve(optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, orders: int | None, tolerance: float) -> Field:
+def solve(
+    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, orders: int | None, tolerance: float
+) -> Field:
     """The field of the light of all orders below ``orders``: what may scatter or reflect once more on the way to an observer.
 
     ``orders``: scattering and reflection events in the final picture; None: all of them, the rest by a geometric tail once the orders shrink
@@ -35,7 +37,7 @@ def solve(optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolutio
     r, channels = resolution, optics.channel_count
     fine = Directions.at_nodes(grid, r.first_up, r.first_down)
     project = Projection(grid, fine, r.first_azimuths, r.first_degree, channels)
-    moments, sky = project(first_order(optics, columns, grid, fine, r.first_azimuths, r.phase_degree))
+    moments, sky = project(first_order(optics, columns, grid, fine, r))
     zeroth = Order(moments, sky, r.first_degree, project.size).zeroth()
     refine = Refinement(grid, zeroth.numpy().reshape(*grid.shape, project.size))
     light = _relative(refine, moments, sky, r.first_degree)
@@ -51,7 +53,9 @@ def solve(optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolutio
         total = total.plus(light)
         if orders is None:
             earlier, ratio = ratio, _ratio(grid, light, before)
-            if order == r.orders or (earlier is not None and _tail_error(grid, total, light, ratio, earlier) < 0.1 * tolerance):
+            if order == r.orders or (
+                earlier is not None and _tail_error(grid, total, light, ratio, earlier) < 0.1 * tolerance
+            ):
                 return Field(optics, columns, grid, refine, *_with_tail(total, light, ratio))
     raise AssertionError("unreachable")
 

@@ -18,7 +18,15 @@ from .backend import channels, floats, parameter, types
 from .profile import Exponential, Tabulated, Tent
 
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
-LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)  # scale heights at which rays are cut: the field is asked once between two cuts
+LEVELS = (
+    0.5,
+    1.0,
+    1.75,
+    2.5,
+    3.75,
+    5.0,
+    9.0,
+)  # scale heights at which rays are cut: the field is asked once between two cuts
 
 
 class Optics:
@@ -39,7 +47,9 @@ class Optics:
         self.albedo = channels(atmosphere.ground_albedo[indices])
         self.scattering = [channels(c.scattering_per_m[indices]) for c in self.constituents]
         self.extinction = [channels(c.extinction_per_m[indices]) for c in self.constituents]
-        self.scatterers = [k for k, c in enumerate(self.constituents) if c.phase is not None and np.any(c.scattering_per_m > 0)]
+        self.scatterers = [
+            k for k, c in enumerate(self.constituents) if c.phase is not None and np.any(c.scattering_per_m > 0)
+        ]
         self._profiles = [_with_parameters(c.profile) for c in self.constituents]
         self._phases = [_phases(c, indices) for c in self.constituents]
 
@@ -85,7 +95,9 @@ class Optics:
 
         def term(l_: Any, current: Any, last: Any, sums: list[Any]) -> tuple[Any, ...]:
             n = t.Float(l_)
-            sums = [dr.fma((2.0 * n + 1.0) * dr.gather(t.Float, c, l_), current, s) for c, s in zip(chi, sums, strict=True)]
+            sums = [
+                dr.fma((2.0 * n + 1.0) * dr.gather(t.Float, c, l_), current, s) for c, s in zip(chi, sums, strict=True)
+            ]
             following = ((2.0 * n + 1.0) * nu * current - n * last) / (n + 1.0)
             return l_ + 1, following, current, sums
 

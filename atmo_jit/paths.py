@@ -7,7 +7,9 @@ travelled about the planet's centre) is independent of sun and azimuth.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +41,7 @@ class Paths:
     ``cos_turn``, ``sin_turn`` (angle about the centre), ``u`` (altitude coordinate). Per ray: ``h``, ``mu_start``; ``ground``: it ends on it.
 
     The field is looked up at visits: one per station on a level, two (the levels below and above) at a perigee. Per visit: its ``station``,
-    ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each ray's visits start.
+    ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each ray's visits start. ``locate`` gives level and share of an altitude.
     """
 
     first: np.ndarray
@@ -56,6 +58,7 @@ class Paths:
     level: np.ndarray
     factor: np.ndarray
     first_visit: np.ndarray
+    locate: Callable[[Any], tuple[Any, Any]]
 
     @property
     def count(self) -> int:
@@ -63,10 +66,10 @@ class Paths:
         return len(self.ray)
 
     @classmethod
-    def trace(cls, grid: Grid, directions: Directions) -> Paths:
-        """Trace every direction of every node altitude to the ground or the top."""
-        radius, levels = grid.radius_m, grid.levels
-        count, refine = len(levels), (len(levels) - 1) // (len(grid.h) - 1)
+    def trace(cls, grid: Grid, directions: Directions, refine: int) -> Paths:
+        """Trace every direction of every node altitude to the ground or the top, with ``refine`` levels per altitude interval."""
+        radius, levels = grid.radius_m, grid.levels_at(refine)
+        count = len(levels)
         k = np.repeat(np.arange(len(grid.h)) * refine, directions.mu.shape[1])
         h, mu = levels[k], directions.mu.ravel()
         r = radius + h
@@ -97,7 +100,7 @@ class Paths:
         there = radius + altitude
 
         ray, column = np.nonzero(reached)
-        u = grid.u_of(altitude)
+        u = refine * grid.u_of(altitude)
         u = np.where(at_perigee, u, index)[ray, column]
         d, r_there = distance[ray, column], there[ray, column]
         below = np.minimum(np.floor(u).astype(int), count - 2)
@@ -121,4 +124,5 @@ class Paths:
             level=below[station] + upper,
             factor=np.where(upper, share[station], 1.0 - share[station]),
             first_visit=np.searchsorted(station, first),
+            locate=lambda altitude: grid.locate_altitude(altitude, refine),
         )

@@ -20,7 +20,8 @@ class Resolution:
 
     ``altitudes``, ``suns``: nodes solved for; ``refine``: parts into which cubic interpolation divides every interval of either.
     ``up``, ``down``, ``azimuths``: directions at a node for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for
-    order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
+    order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there;
+    ``beam_*``: altitude levels per interval and azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
     sun-column table (altitudes, cosines).
     """
 
@@ -36,6 +37,8 @@ class Resolution:
     first_azimuths: int = 14
     first_degree: int = 12
     phase_degree: int = 16
+    beam_refine: int = 4
+    beam_azimuths: int = 6
     orders: int = 20
     columns: tuple[int, int] = (128, 96)
 

@@ -55,10 +55,14 @@ class Projection:
         pair, rest = lane % pair_total, lane // pair_total
         sun, k = rest % suns, rest // suns
         m = dr.gather(t.UInt, self._m, pair)
-        moments = self._sum_directions(harmonics, k, m, sun, lambda ray: dr.gather(t.Float, self._basis, ray * pair_total + pair))
+        moments = self._sum_directions(
+            harmonics, k, m, sun, lambda ray: dr.gather(t.Float, self._basis, ray * pair_total + pair)
+        )
         lane0 = dr.arange(t.UInt, altitudes * suns)
         sun, k = lane0 % suns, lane0 // suns
-        irradiance = self._sum_directions(harmonics, k, t.UInt(0), sun, lambda ray: dr.gather(t.Float, self._upward, ray))
+        irradiance = self._sum_directions(
+            harmonics, k, t.UInt(0), sun, lambda ray: dr.gather(t.Float, self._upward, ray)
+        )
         return stored(moments, lane, size), stored(irradiance, lane0, size)
 
     def _sum_directions(self, harmonics: Any, k: Any, m: Any, sun: Any, weight: Any) -> list[Any]:

@@ -64,3 +64,10 @@ def _partial_weights(horizon_mu: float, count: int) -> np.ndarray:
 def half_circle(count: int) -> np.ndarray:
     """Azimuths at the midpoints of ``count`` equal parts of [0, pi]: exact for cos(m phi), 0 < m < 2 count."""
     return (np.arange(count) + 0.5) * np.pi / count
+
+
+def cosine_interpolation(count: int, azimuths: np.ndarray) -> np.ndarray:
+    """Matrix [len(azimuths), count]: the cosine series through values at half_circle(count), evaluated at ``azimuths``."""
+    m = np.arange(count)
+    series = np.cos(m[:, None] * half_circle(count)) * np.where(m == 0, 1.0, 2.0)[:, None] / count
+    return np.cos(np.asarray(azimuths)[:, None] * m) @ series

@@ -26,7 +26,9 @@ class Order:
     def zeroth(self) -> Any:
         """The zeroth moment, [K, S, size]."""
         lane = dr.arange(types().UInt, dr.width(self.sky))
-        return dr.gather(types().Float, self.moments, lane // self.size * (pair_count(self.degree) * self.size) + lane % self.size)
+        return dr.gather(
+            types().Float, self.moments, lane // self.size * (pair_count(self.degree) * self.size) + lane % self.size
+        )
 
     def plus(self, other: Order, factor: Any = None) -> Order:
         """The sum with an order of equal or lower degree, which is first multiplied by ``factor`` [S, size] if that is given."""
@@ -39,7 +41,9 @@ class Order:
         pair, node = lane // size % count, lane // (size * count)
         there = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair)
         held = dr.gather(t.UInt, uints(source >= 0), pair) > 0
-        moments = dr.gather(t.Float, other.moments, (node * pair_count(other.degree) + there) * size + lane % size, held)
+        moments = dr.gather(
+            t.Float, other.moments, (node * pair_count(other.degree) + there) * size + lane % size, held
+        )
         sky = other.sky
         if factor is not None:
             period = dr.opaque(t.UInt, dr.width(factor) // size, 1)
@@ -68,12 +72,16 @@ class Refinement:
     def altitudes(self, values: Any) -> Any:
         """[K, ...] -> [levels, ...]."""
         count = self.grid.shape[0]
-        return self._along(values, self._altitudes, count, len(self.grid.levels), dr.width(values) // (count * self.size), 1)
+        return self._along(
+            values, self._altitudes, count, len(self.grid.levels), dr.width(values) // (count * self.size), 1
+        )
 
     def suns(self, values: Any, outer: int) -> Any:
         """[outer, S, ...] -> [outer, sources, ...]."""
         count = self.grid.shape[1]
-        return self._along(values, self._suns, count, self.grid.sources, dr.width(values) // (outer * count * self.size), outer)
+        return self._along(
+            values, self._suns, count, self.grid.sources, dr.width(values) // (outer * count * self.size), outer
+        )
 
     def both(self, values: Any) -> Any:
         """[K, S, ...] -> [levels, sources, ...]."""

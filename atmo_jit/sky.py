@@ -44,7 +44,9 @@ class RayLight:
 class _Band:
     """The solution at up to four wavelengths."""
 
-    def __init__(self, atmosphere: Atmosphere, indices: np.ndarray, resolution: Resolution, orders: int | None, tolerance: float) -> None:
+    def __init__(
+        self, atmosphere: Atmosphere, indices: np.ndarray, resolution: Resolution, orders: int | None, tolerance: float
+    ) -> None:
         self.optics = Optics(atmosphere, indices)
         self.columns = SunColumns(self.optics, resolution.columns)
         self.field = solve(self.optics, self.columns, Grid(atmosphere, resolution), resolution, orders, tolerance)
@@ -121,7 +123,9 @@ class Sky:
             sky += [dr.select(inside, value, 0.0) for value in band.field.irradiance(level, mu_s)]
         return sun, sky
 
-    def _enter(self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any) -> tuple[Rays, Any, Any]:
+    def _enter(
+        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any
+    ) -> tuple[Rays, Any, Any]:
         """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether they leave for space."""
         t = types()
         wide = t.Float64
@@ -214,7 +218,9 @@ def sky(
     count = len(checked["altitude_m"])
     parts = []
     for first in range(0, count, VIEWS_AT_ONCE):
-        parts.append(_evaluate(solved, {name: v[first : first + VIEWS_AT_ONCE] for name, v in checked.items()}, ground, sun_disc))
+        parts.append(
+            _evaluate(solved, {name: v[first : first + VIEWS_AT_ONCE] for name, v in checked.items()}, ground, sun_disc)
+        )
         if progress is not None:
             progress(min(first + VIEWS_AT_ONCE, count) / count)
     arrays = [np.concatenate(column) for column in zip(*parts, strict=True)]
@@ -241,4 +247,6 @@ def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_di
     groups = (light.radiance, light.transmittance, sun, scattered)
     dr.eval(groups)
     shape = views["altitude_m"].shape
-    return [np.stack([np.broadcast_to(v.numpy(), shape) for v in group], axis=-1).astype(np.float32) for group in groups]
+    return [
+        np.stack([np.broadcast_to(v.numpy(), shape) for v in group], axis=-1).astype(np.float32) for group in groups
+    ]

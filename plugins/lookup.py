@@ -19,8 +19,8 @@ ROWS = ROWS_DOWN + ROWS_UP
 # Importance of a cell: luminance times this. Surfaces that see the zenith see it at a better angle than the horizon; those that see the ground
 # find it by sampling their BSDF, since it has no small bright features.
 HORIZON_IMPORTANCE = 0.5
-GROUND_SHARE = 0.02
-LOW_SUN_IMPORTANCE = 0.25
+GROUND_SHARE = 0.015
+LOW_SUN_IMPORTANCE, FULL_IMPORTANCE_SINE = 0.3, 0.25
 # Share of the sky's samples that is spread evenly, so that no direction has density 0 (night, black sky seen from space).
 EVEN_SHARE = 0.005
 
@@ -163,7 +163,8 @@ class SunLookup:
 def sun_share(sun: float, sky: float, sine: float) -> float:
     """Probability of sampling the sun, given the luminous irradiance across its beam, the sky's flux and the sine of its elevation.
 
-    A low sun counts for less: surfaces that face it have noise to spare, the ground does not. 0 without a sun.
+    Below 15 degrees the sun counts for less: surfaces that face it have noise to spare, the ground does not. 0 without a sun.
     """
-    weight = sun * (LOW_SUN_IMPORTANCE + (1.0 - LOW_SUN_IMPORTANCE) * max(sine, 0.0))
+    high = min(max(sine, 0.0) / FULL_IMPORTANCE_SINE, 1.0)
+    weight = sun * (LOW_SUN_IMPORTANCE + (1.0 - LOW_SUN_IMPORTANCE) * high)
     return weight / (weight + sky) if weight > 0.0 else 0.0

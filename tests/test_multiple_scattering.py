@@ -66,7 +66,9 @@ FLAT = {
     "conservative gas": ([1.0, 0.0, 0.1], 1.0, 0.35, 0.3),
     "isotropic haze, bright ground": ([1.0], 0.9, 0.8, 0.8),
     "forward haze": (0.5 ** np.arange(30), 0.95, 0.5, 0.1),
+    "thick cloud": (0.5 ** np.arange(30), 0.99, 4.0, 0.1),
 }
+"""Legendre moments, single-scattering albedo, optical depth and ground albedo of homogeneous flat layers."""
 
 
 def flat_world(moments, scattered: float, depth: float, albedo: float) -> dict:
