@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
-from .backend import floats, packet, padded, stored, types
+from .backend import floats, packet, padded, stored, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pairs, recurrence
@@ -22,30 +23,40 @@ from .refinement import Order, Refinement
 class Field:
     """The light of a sum of orders at the refined nodes.
 
-    ``light``: its moments scatter once more (None: nothing does); ``sky``: irradiance [K, S, size] of the light that arrives, which may be of
-    one order more.
+    ``first``: order 1, at its own suns; ``rest``: the sum of the later orders that scatter once more (None: there are none), ``arriving``: their
+    sky irradiance [K, S, size], which may be of one order more. ``scatters``: whether any of it scatters once more.
     """
 
     def __init__(
-        self, optics: Optics, columns: SunColumns, grid: Grid, refine: Refinement, light: Order | None, sky: Any
+        self,
+        optics: Optics,
+        columns: SunColumns,
+        grid: Grid,
+        refine: Refinement,
+        first: Order,
+        rest: Order | None,
+        arriving: Any,
+        *,
+        scatters: bool = True,
     ) -> None:
         self.optics, self.columns, self.grid = optics, columns, grid
         self.log_reference = refine.log_reference
-        self.sky = refine.both(self._per_depth(sky))
-        self.light = light
-        if light is None:
+        self.scatters = scatters
+        suns = len(grid.first_theta), grid.shape[1]
+        once = refine.both(self._per_depth(first.sky, suns[0]), suns[0])
+        self.sky = once if arriving is None else once + refine.both(self._per_depth(arriving, suns[1]), suns[1])
+        if rest is None:
             return
-        self.degree = light.degree
-        self.moments, self.reflected = refine.both(light.moments), refine.both(self._per_depth(light.sky))
+        self.degree = first.degree
+        self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
+        self.moments = _sum(refine.both(first.moments, suns[0]), first, refine.both(rest.moments, suns[1]), rest)
         chi = [optics.phase_moments(k, self.degree) for k in optics.scatterers]
-        self._chi = _interleave(
-            [[chi[i][c] for c in range(optics.channel_count)] for i in range(len(chi))], self.degree
-        )
+        channels = range(optics.channel_count)
+        self._chi = _interleave([[chi[i][c] for c in channels] for i in range(len(chi))], self.degree)
         l_, m = pairs(self.degree)
-        self._recurrence = floats(
-            [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
-        )
-        self._l = floats(l_)
+        rows = [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+        self._recurrence, self._l = floats(rows), floats(l_)
+        dr.eval(self.sky, self.reflected, self.moments)
 
     def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude [2][channel]."""
@@ -59,10 +70,10 @@ class Field:
         channels = range(self.optics.channel_count)
         return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
 
-    def _per_depth(self, irradiance: Any) -> Any:
+    def _per_depth(self, irradiance: Any, suns: int) -> Any:
         """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish, and smooth up to it."""
         t, size = types(), padded(self.optics.channel_count)
-        altitudes, suns = self.grid.shape
+        altitudes = self.grid.shape[0]
         above = self._depth_above(floats(self.grid.h))
         per_altitude = stored(
             [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above],
@@ -150,6 +161,18 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
     for weight, value in zip(weights[1:], values[1:], strict=True):
         total = dr.fma(weight, value, total)
     return total
+
+
+def _sum(moments: Any, order: Order, others: Any, other: Order) -> Any:
+    """``moments`` [nodes, pairs, size] of an order plus those of one of equal or lower degree."""
+    t, size = types(), order.size
+    stored_pairs = [list(zip(*(a.tolist() for a in pairs(o.degree)), strict=True)) for o in (order, other)]
+    place = {pair: i for i, pair in enumerate(stored_pairs[1])}
+    source = np.array([place.get(pair, -1) for pair in stored_pairs[0]])
+    lane = dr.arange(t.UInt, dr.width(moments))
+    pair, node = lane // size % len(source), lane // (size * len(source))
+    there, held = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair), dr.gather(t.UInt, uints(source >= 0), pair) > 0
+    return moments + dr.gather(t.Float, others, (node * len(place) + there) * size + lane % size, held)
 
 
 def _interleave(chi: list[list[Any]], degree: int) -> Any:

@@ -24,26 +24,31 @@ class Grid:
     """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
 
     The field is solved at K altitudes and S suns, and interpolated, cubically, to the refined ``levels`` and ``sources`` suns, on which
-    light is then looked up linearly.
+    light is then looked up linearly. Order 1, which knows the sun's disc, is solved at ``first_theta``, several times as many suns.
     """
 
     def __init__(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
         self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine[0])
-        self._place_suns(resolution.suns, resolution.refine[1])
+        self._place_suns(resolution.suns, resolution.refine[1], resolution.first_suns)
 
     def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
-        # Samples quadratic in altitude, so that a thin layer at the ground is resolved too.
+        # Samples dense near the ground, so that a thin layer there is resolved too.
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 3
-        rise = 0.12 * np.diff(h) / atmosphere.thickness_m
+        middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
+        rise = 0.12 * step / atmosphere.thickness_m
+        extinction = 0.0 * step
         for c in atmosphere.constituents:
-            if c.phase is None or not np.any(c.scattering_per_m > 0):
-                continue
-            density = np.maximum(np.asarray(c.profile.density(0.5 * (h[1:] + h[:-1]))), 0.0)
-            step = density ** (1.0 / 3.0) * np.diff(h)
-            if step.sum() > 0:
-                rise = rise + step / step.sum()
+            density = np.maximum(np.asarray(c.profile.density(middle)), 0.0)
+            extinction = extinction + np.max(c.extinction_per_m) * density
+            share = density ** (1.0 / 3.0) * step
+            if np.any(c.scattering_per_m > 0) and share.sum() > 0:
+                rise = rise + share / share.sum()
+        # Light in a thick layer changes within a free path of its top and bottom, slowly between.
+        depth = extinction * step
+        below = np.cumsum(depth) - 0.5 * depth
+        rise = rise + depth / (1.0 + below) + depth / (1.0 + depth.sum() - below)
         u = np.concatenate([[0.0], np.cumsum(rise)])
         self._u, self._h_of_u, self.refine = u * ((count - 1) / u[-1]), h, refine
         self.h, self.levels = self.levels_at(1), self.levels_at(refine)
@@ -56,7 +61,7 @@ class Grid:
         levels[0], levels[-1] = 0.0, self.thickness_m
         return levels
 
-    def _place_suns(self, count: int, refine: int) -> None:
+    def _place_suns(self, count: int, refine: int, first: int) -> None:
         # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for multiple.
         dip = np.arccos(self.radius_m / (self.radius_m + self.thickness_m))
         end = min(0.5 * np.pi + 2.2 * dip, np.pi)
@@ -66,8 +71,11 @@ class Grid:
         fine = refine * (count - 1)
         self._scale = fine / self._sun_coordinate(end)
         self.sources = fine + 1  # refined suns
-        self.theta = np.interp(np.linspace(0.0, fine, count), self._sun_coordinate(theta), theta)
+        self.theta, self.first_theta = (
+            np.interp(np.linspace(0.0, fine, n), self._sun_coordinate(theta), theta) for n in (count, first * (count - 1) + 1)
+        )
         self.sun_refinement = _cubic_refinement(count, refine, even=True)
+        self.first_sun_refinement = _cubic_refinement(first * (count - 1) + 1, refine // first, even=True)
 
     def _sun_coordinate(self, theta: np.ndarray | float) -> np.ndarray:
         bend = np.arctan((theta - self._center) / self._width) + np.arctan(self._center / self._width)

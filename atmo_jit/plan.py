@@ -18,16 +18,17 @@ DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shar
 class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
-    ``altitudes``, ``suns``: nodes solved for; ``refine``: parts into which cubic interpolation divides every interval of either.
+    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``: parts into which cubic interpolation divides every interval of either.
     ``up``, ``down``, ``azimuths``: directions at a node for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for
     order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there;
-    ``beam_*``: altitude levels per interval and azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved before the geometric tail. ``columns``: size of the
+    ``beam_*``: altitude levels per interval and azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved. ``columns``: size of the
     sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
-    suns: int = 41
-    refine: tuple[int, int] = (2, 3)
+    suns: int = 25
+    refine: tuple[int, int] = (2, 4)
+    first_suns: int = 2
     up: int = 6
     down: int = 4
     azimuths: int = 8
@@ -39,7 +40,7 @@ class Resolution:
     phase_degree: int = 16
     beam_refine: int = 4
     beam_azimuths: int = 6
-    orders: int = 20
+    orders: int = 40
     columns: tuple[int, int] = (128, 96)
 
     @classmethod
@@ -52,7 +53,7 @@ class Resolution:
         later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
         fine = tolerance < 0.005
         return cls(
-            altitudes=16 if fine else 12,
+            altitudes=_altitudes(atmosphere, 16 if fine else 12),
             up=max(6, later // 2 + 5),
             down=max(4, later // 3 + 4),
             azimuths=max(later, first // 2) + 2,
@@ -71,7 +72,7 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
     for constituent in atmosphere.constituents:
         if constituent.phase is None:
             continue
-        share = -np.expm1(-3.0 * _scattering_depth(atmosphere, constituent))
+        share = -np.expm1(-3.0 * constituent.scattering_per_m * _column(atmosphere, constituent))
         for wavelength in range(len(atmosphere.wavelengths_nm)):
             chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
             term = share[wavelength] * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
@@ -80,8 +81,14 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
     return next((degree for degree in DEGREES if degree >= needed), DEGREES[-1])
 
 
-def _scattering_depth(atmosphere: Atmosphere, constituent: Constituent) -> np.ndarray:
-    """Vertical scattering optical depth [W] of a constituent."""
+def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
+    """Node altitudes: more where the air is optically thick, in steps of four so that kernels are shared."""
+    depth = sum((c.extinction_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    extra = 8.0 * np.log2(1.0 + max(float(np.max(depth)) - 0.4, 0.0) / 2.0)
+    return min(clear + 4 * int(np.ceil(extra / 4.0)), 48)
+
+
+def _column(atmosphere: Atmosphere, constituent: Constituent) -> float:
+    """Vertical column (m) of a constituent's density."""
     h = atmosphere.thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
-    column = np.trapezoid(np.asarray(constituent.profile.density(h)), h)
-    return constituent.scattering_per_m * column
+    return float(np.trapezoid(np.asarray(constituent.profile.density(h)), h))

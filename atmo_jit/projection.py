@@ -17,9 +17,9 @@ from .quadrature import half_circle
 class Projection:
     """From radiance in discrete directions at the nodes to moments and irradiance: sums over azimuth, then over zenith cosine."""
 
-    def __init__(self, grid: Grid, directions: Directions, azimuths: int, degree: int, channels: int) -> None:
+    def __init__(self, grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int) -> None:
         t = types()
-        self.grid, self.directions, self.azimuths, self.degree = grid, directions, azimuths, degree
+        self.grid, self.suns, self.directions, self.azimuths, self.degree = grid, suns, directions, azimuths, degree
         self.size = padded(channels)
         self.count = directions.mu.shape[1]
         m = np.arange(degree + 1)
@@ -33,7 +33,7 @@ class Projection:
     def __call__(self, radiance: Any) -> tuple[Any, Any]:
         """``radiance`` [K, D, S, azimuths, channels] -> moments [K, S, pairs, channels], irradiance [K, S, channels]."""
         t, size = self._types, self.size
-        altitudes, suns = self.grid.shape
+        altitudes, suns = self.grid.shape[0], self.suns
         orders, count, azimuths = self.degree + 1, self.count, self.azimuths
         lane = dr.arange(t.UInt, altitudes * count * orders * suns)
         sun, rest = lane % suns, lane // suns
@@ -67,7 +67,7 @@ class Projection:
 
     def _sum_directions(self, harmonics: Any, k: Any, m: Any, sun: Any, weight: Any) -> list[Any]:
         t, size = self._types, self.size
-        suns, orders, count = self.grid.shape[1], self.degree + 1, self.count
+        suns, orders, count = self.suns, self.degree + 1, self.count
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             ray = k * count + i

@@ -17,7 +17,7 @@ STEEPEST = 1.2  # e-folds of the reference from one sun node to the next
 class Order:
     """Light of one order, or a sum of orders, at the solved nodes, divided by the reference.
 
-    ``moments`` [K, S, pairs(degree), size] and ``sky`` irradiance [K, S, size]; ``size``: channels, padded.
+    ``moments`` [K, S, pairs(degree), size] and ``sky`` irradiance [K, S, size]; ``size``: channels, padded. S: the suns of the solve, or of order 1.
     """
 
     def __init__(self, moments: Any, sky: Any, degree: int, size: int) -> None:
@@ -30,44 +30,45 @@ class Order:
             types().Float, self.moments, lane // self.size * (pair_count(self.degree) * self.size) + lane % self.size
         )
 
-    def plus(self, other: Order, factor: Any = None) -> Order:
-        """The sum with an order of equal or lower degree, which is first multiplied by ``factor`` [S, size] if that is given."""
-        t, size = types(), self.size
-        both = [list(zip(*(a.tolist() for a in pairs(d)), strict=True)) for d in (self.degree, other.degree)]
-        place = {pair: i for i, pair in enumerate(both[1])}
-        source = np.array([place.get(pair, -1) for pair in both[0]])
-        count = pair_count(self.degree)
-        lane = dr.arange(t.UInt, dr.width(self.moments))
-        pair, node = lane // size % count, lane // (size * count)
-        there = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair)
-        held = dr.gather(t.UInt, uints(source >= 0), pair) > 0
-        moments = dr.gather(
-            t.Float, other.moments, (node * pair_count(other.degree) + there) * size + lane % size, held
-        )
-        sky = other.sky
-        if factor is not None:
-            period = dr.opaque(t.UInt, dr.width(factor) // size, 1)
-            moments *= dr.gather(t.Float, factor, node % period * size + lane % size)
-            sky = sky * dr.gather(t.Float, factor, dr.arange(t.UInt, dr.width(sky)) % (period * size))
-        moments, sky = self.moments + moments, self.sky + sky
-        dr.eval(moments, sky)
-        return Order(moments, sky, self.degree, size)
+    def numpy(self, grid: Grid) -> np.ndarray:
+        """The moments as an array [K, S, pairs, size]."""
+        return self.moments.numpy().reshape(grid.shape[0], -1, pair_count(self.degree), self.size)
+
+
+def combined(orders: list[Order], weights: np.ndarray) -> Order:
+    """Sum of orders of one degree, each times its weight: ``weights`` [len(orders), S, size]."""
+    t = types()
+    size, suns = orders[0].size, weights.shape[1]
+    moments, sky = 0.0, 0.0
+    per_node = pair_count(orders[0].degree)
+    lane, sky_lane = (dr.arange(t.UInt, dr.width(b)) for b in (orders[0].moments, orders[0].sky))
+    place = lane // (size * per_node) % suns * size + lane % size
+    for order, weight in zip(orders, weights, strict=True):
+        factor = floats(weight)
+        moments = dr.fma(dr.gather(t.Float, factor, place), order.moments, moments)
+        sky = dr.fma(dr.gather(t.Float, factor, sky_lane % (suns * size)), order.sky, sky)
+    dr.eval(moments, sky)
+    return Order(moments, sky, orders[0].degree, size)
 
 
 class Refinement:
     """Cubic interpolation between the solved nodes, of quotients over the reference.
 
     Linear interpolation between the solved nodes would bias the twilight by some tenths of a per cent; solving at the refined ones costs
-    several times as much. ``log_reference`` [levels, sources, size]; ``inverse`` [K, S, size] is 1 / reference.
+    several times as much. ``log_reference`` [levels, sources, size]; ``inverse`` [K, S, size] and ``first_inverse`` (at the suns of order 1):
+    1 / reference. The reference, given at the suns of order 1, guides only: it carries no derivative.
     """
 
     def __init__(self, grid: Grid, reference: np.ndarray) -> None:
         self.grid, self.size = grid, reference.shape[-1]
-        logs = _steadied(np.log(np.maximum(reference, 1e-30)))
-        self.inverse = floats(np.exp(-logs))
-        fine = np.einsum("fs,ksc->kfc", grid.sun_refinement, logs)
+        first = (reference.shape[1] - 1) // (grid.shape[1] - 1)
+        logs = _steadied(np.log(np.maximum(reference, 1e-30)), STEEPEST / first)
+        self.first_inverse, self.inverse = floats(np.exp(-logs)), floats(np.exp(-logs[:, ::first]))
+        fine = np.einsum("fs,ksc->kfc", grid.first_sun_refinement, logs)
         self.log_reference = floats(np.einsum("lk,kfc->lfc", grid.altitude_refinement, fine))
-        self._suns, self._altitudes = _taps(grid.sun_refinement), _taps(grid.altitude_refinement)
+        self._first_suns, self._suns, self._altitudes = (
+            _taps(m) for m in (grid.first_sun_refinement, grid.sun_refinement, grid.altitude_refinement)
+        )
 
     def altitudes(self, values: Any) -> Any:
         """[K, ...] -> [levels, ...]."""
@@ -76,16 +77,32 @@ class Refinement:
             values, self._altitudes, count, len(self.grid.levels), dr.width(values) // (count * self.size), 1
         )
 
-    def suns(self, values: Any, outer: int) -> Any:
-        """[outer, S, ...] -> [outer, sources, ...]."""
-        count = self.grid.shape[1]
-        return self._along(
-            values, self._suns, count, self.grid.sources, dr.width(values) // (outer * count * self.size), outer
-        )
+    def suns(self, values: Any, outer: int, count: int | None = None) -> Any:
+        """[outer, S, ...] -> [outer, sources, ...]; ``count``: S, that of the solve or that of order 1."""
+        count = count or self.grid.shape[1]
+        taps = self._suns if count == self.grid.shape[1] else self._first_suns
+        return self._along(values, taps, count, self.grid.sources, dr.width(values) // (outer * count * self.size), outer)
 
-    def both(self, values: Any) -> Any:
-        """[K, S, ...] -> [levels, sources, ...]."""
-        return self.suns(self.altitudes(values), len(self.grid.levels))
+    def both(self, values: Any, suns: int) -> Any:
+        """[K, S, ...] -> [levels, sources, ...], S being ``suns``."""
+        return self.suns(self.altitudes(values), len(self.grid.levels), suns)
+
+    def thinned(self, order: Order) -> Order:
+        """Order 1 at the suns of the solve only."""
+        t = types()
+        altitudes, suns = self.grid.shape
+        fine = len(self.grid.first_theta)
+        step = (fine - 1) // (suns - 1)
+
+        def pick(values: Any) -> Any:
+            inner = dr.width(values) // (altitudes * fine)
+            lane = dr.arange(t.UInt, altitudes * suns * inner)
+            item, node = lane % inner, lane // inner
+            picked = dr.gather(t.Float, values, (node // suns * fine + node % suns * step) * inner + item)
+            dr.eval(picked)
+            return picked
+
+        return Order(pick(order.moments), pick(order.sky), order.degree, order.size)
 
     def _along(self, values: Any, taps: tuple[Any, Any], count: int, refined: int, inner: int, outer: int) -> Any:
         """Interpolate the middle axis of [outer, count, inner, size]."""
@@ -107,15 +124,15 @@ def _taps(matrix: np.ndarray) -> tuple[Any, Any]:
     return uints(first), floats(np.take_along_axis(matrix, first[:, None] + np.arange(4), axis=1))
 
 
-def _steadied(logs: np.ndarray) -> np.ndarray:
-    """Logarithms [K, S, size] kept from changing by more than STEEPEST between neighbouring suns.
+def _steadied(logs: np.ndarray, steepest: float) -> np.ndarray:
+    """Logarithms [K, S, size] kept from changing by more than ``steepest`` between neighbouring suns.
 
     In the planet's shadow order 1 vanishes and later orders do not: their quotient must stay moderate.
     """
     logs = logs.copy()
     suns = logs.shape[1]
     for s in range(1, suns):
-        logs[:, s] = np.maximum(logs[:, s], logs[:, s - 1] - STEEPEST)
+        logs[:, s] = np.maximum(logs[:, s], logs[:, s - 1] - steepest)
     for s in range(suns - 2, -1, -1):
-        logs[:, s] = np.maximum(logs[:, s], logs[:, s + 1] - STEEPEST)
+        logs[:, s] = np.maximum(logs[:, s], logs[:, s + 1] - steepest)
     return logs

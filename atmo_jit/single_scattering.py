@@ -73,12 +73,12 @@ def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeight
     """Scattered sunlight per scatterer without its phase function, then light from the ground: [rays, S, azimuths, 1 + scatterers, size]."""
     t = types()
     kinds, channels, size = len(optics.scatterers), optics.channel_count, beam.size
-    suns = grid.shape[1]
+    suns = len(grid.first_theta)
     lane = dr.arange(t.UInt, len(paths.h) * suns * azimuths)
     azimuth, rest = lane % azimuths, lane // azimuths
     sun, ray = rest % suns, rest // suns
-    mu_s = dr.gather(t.Float, floats(np.cos(grid.theta)), sun)
-    across = dr.gather(t.Float, floats(np.sin(grid.theta)), sun) * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
+    mu_s = dr.gather(t.Float, floats(np.cos(grid.first_theta)), sun)
+    across = dr.gather(t.Float, floats(np.sin(grid.first_theta)), sun) * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
     visits = len(paths.station)
     turns = floats(np.column_stack([paths.cos_turn[paths.station], paths.sin_turn[paths.station]]))
     rows = stored([weights.weights[n * channels + c] if c < channels else t.Float(0.0) for n in range(kinds) for c in range(size)] or [t.Float(0.0)], dr.arange(t.UInt, visits), max(kinds * size, 1))
@@ -113,12 +113,12 @@ def _times_phase(optics: Optics, glow: Any, grid: Grid, directions: Directions, 
     """Radiance [K, D, S, first_azimuths, size] from the ground's and the scatterers' parts at ``beam_azimuths``."""
     t = types()
     kinds, channels, size = len(optics.scatterers), optics.channel_count, padded(optics.channel_count)
-    suns, azimuths, few = grid.shape[1], r.first_azimuths, r.beam_azimuths
+    suns, azimuths, few = len(grid.first_theta), r.first_azimuths, r.beam_azimuths
     rays = directions.mu.size
     lane = dr.arange(t.UInt, rays * suns * azimuths)
     azimuth, rest = lane % azimuths, lane // azimuths
     mu = dr.gather(t.Float, floats(directions.mu), rest // suns)
-    mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.theta)), rest % suns) for f in (np.cos, np.sin))
+    mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.first_theta)), rest % suns) for f in (np.cos, np.sin))
     cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
     nu = dr.clip(dr.fma(mu, mu_s, safe_sine(mu) * sin_s * cos_phi), -1.0, 1.0)
     taps = floats(cosine_interpolation(few, half_circle(azimuths)))
@@ -146,7 +146,7 @@ def ground_light(optics: Optics, columns: SunColumns, rays: Any, field: Field | 
     direct = sun_irradiance(optics, columns, h, optics.radius + 0.0 * r, mu_s, rays.ground)
     sky = (
         field.irradiance(h + 0.0 * r, mu_s, rays.ground, reflected=True)
-        if field is not None and field.light is not None
+        if field is not None and field.scatters
         else [0.0] * optics.channel_count
     )
     return [

@@ -50,7 +50,7 @@ class _Band:
         self.optics = Optics(atmosphere, indices)
         self.columns = SunColumns(self.optics, resolution.columns)
         self.field = solve(self.optics, self.columns, Grid(atmosphere, resolution), resolution, orders, tolerance)
-        self.source = self.field if self.field.light is not None and self.optics.scatterers else None
+        self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 
 class Sky:

@@ -1,4 +1,4 @@
-"""Mitsuba 3 plugins: the emitter ``atmosphere``.
+"""Mitsuba 3 plugins: see ``PLUGINS``.
 
 >>> import mitsuba as mi
 >>> mi.set_variant("llvm_ad_rgb")
@@ -12,9 +12,19 @@ Importing this package registers nothing and does not import Mitsuba.
 from __future__ import annotations
 
 from functools import cache
+from importlib import import_module
 from typing import Any
 
-__all__ = ["register"]
+__all__ = ["PLUGINS", "register"]
+
+# Plugin: its kind and base class in Mitsuba, the module here and the class in it.
+PLUGINS = {
+    "atmosphere": ("emitter", "Emitter", "emitter", "AtmosphereEmitter"),
+    "atmosphere_medium": ("medium", "Medium", "medium", "AtmosphereMedium"),
+    "cornette_shanks": ("phase", "PhaseFunction", "cornette_shanks", "CornetteShanksPhase"),
+    "fisheye": ("sensor", "Sensor", "sensors", "Fisheye"),
+    "latlong": ("sensor", "Sensor", "sensors", "LatLong"),
+}
 
 
 def register() -> None:
@@ -36,20 +46,21 @@ def _on_variant(old: str | None, new: str) -> None:
 
     # Mitsuba asks scalar_rgb what kind of object a plugin is, whatever the variant.
     for module in (mi, mi.scalar_rgb):
-        module.register_emitter("atmosphere", _emitter)
+        for name, (kind, *_) in PLUGINS.items():
+            getattr(module, f"register_{kind}")(name, lambda props, name=name: plugin_class(name)(props))
 
 
-def _emitter(props: Any) -> Any:
-    """The constructor that Mitsuba calls, in the variant that is current then."""
+def plugin_class(name: str) -> type:
+    """The class of a plugin in the current variant."""
     import mitsuba as mi
 
-    return _emitter_class(mi.variant())(props)
+    return _plugin_class(name, mi.variant())
 
 
 @cache
-def _emitter_class(variant: str) -> type:
-    """Plugin classes inherit from the variant's own Emitter, so there is one per variant, made when it is first needed."""
-    from .emitter import AtmosphereEmitter
+def _plugin_class(name: str, variant: str) -> type:
+    """Plugin classes inherit from the variant's own base class, so there is one per variant, made when it is first needed."""
     from .variants import bound
 
-    return bound(AtmosphereEmitter, "Emitter")
+    _, base, module, description = PLUGINS[name]
+    return bound(getattr(import_module(f"{__name__}.{module}"), description), base)

@@ -40,9 +40,11 @@ def _shapes() -> Any:
         for i in range(len(batch)):
             try:
                 shape = pointers[i]
-            except RuntimeError:  # no shape of that number
+            except RuntimeError:  # no shape has had this number
+                shape = None
+            if shape is None:
                 missing += 1
-                continue
-            missing = 0
-            yield shape
+            else:
+                missing = 0
+                yield shape
         index += len(batch)

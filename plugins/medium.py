@@ -1,0 +1,97 @@
+"""The medium plugin ``atmosphere_medium``: its reference page, its parameters and Mitsuba's interface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.errors import AtmosphereError, shown
+
+from . import settings
+from .air import Air
+from .mixture import AirPhase
+from .variants import bound
+from .wavelengths import Wavelengths
+
+
+class AtmosphereMedium:
+    """
+.. _medium-atmosphere_medium:
+
+The air of a planet (:monosp:`atmosphere_medium`)
+-------------------------------------------------
+"""
+
+    def __init__(self, props: Any) -> None:
+        if any(isinstance(value, mi.PhaseFunction) for _, value in props.objects()):
+            raise AtmosphereError("phase", "a phase function", "none: those of the atmosphere's constituents are used")
+        phase = bound(AirPhase, "PhaseFunction")(mi.Properties())
+        props["phase"] = phase
+        mi.Medium.__init__(self, props)
+        atmosphere = _atmosphere(props)
+        scale = settings.number(props, "scale", 1.0)
+        if not scale > 0.0:
+            raise AtmosphereError("scale", shown(scale), "a finite number > 0 (scene units per metre)")
+        default = [0.0, 0.0, -atmosphere.bottom_radius_m * scale]
+        center = np.array(settings.values(props["center"]) if "center" in props else default, dtype=np.float64)
+        if center.shape != (3,) or not np.all(np.isfinite(center)):
+            raise AtmosphereError("center", shown(center.tolist()), "a point of three finite numbers (scene units)")
+        channels = props.get("channels", None)
+        if channels is not None:
+            channels = [int(v) for v in np.atleast_1d(settings.values(channels))]
+        wavelengths = Wavelengths(atmosphere.wavelengths_nm, props.get("wavelength_mode", "channels"), channels)
+        self.air = Air(atmosphere, center, scale, wavelengths)
+        phase.use(self.air)
+        self.m_is_homogeneous = False
+        self.m_has_spectral_extinction = not wavelengths.achromatic
+        # What one call of sample_interaction hands on from one of the methods below to the next.
+        self._lowest: Any = None
+        self._bound: Any = None
+
+    def traverse(self, callback: Any) -> None:
+        mi.Medium.traverse(self, callback)
+        for name, value in self.air.values.items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        self.air.update()
+
+    def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+        hits, near, far, lowest = self.air.along(ray)
+        self._lowest = lowest
+        return hits, near, far
+
+    def get_majorant(self, mei: Any, active: Any = True) -> Any:
+        lowest, self._lowest = self._lowest, None
+        if lowest is None:  # asked outside of sample_interaction: nothing is known of the ray
+            lowest = mi.Float(0.0)
+        self._bound = self.air.majorant(lowest, mei) * (1.0 / self.air.scale)
+        return mi.UnpolarizedSpectrum(self._bound)
+
+    def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        bound_, self._bound = self._bound, None
+        if bound_ is None:
+            bound_ = self.air.majorant(mi.Float(0.0), mei) * (1.0 / self.air.scale)
+        value = self.air.pick(mei)
+        densities = self.air.densities(self.air.altitude(mei.p))
+        sigma_s = sigma_t = mi.UnpolarizedSpectrum(0.0)
+        for c, density in zip(self.air.atmosphere.constituents, densities, strict=True):
+            if c.phase is not None:
+                sigma_s = sigma_s + self.air.scattering(c, value) * density
+            sigma_t = sigma_t + self.air.extinction(c, value) * density
+        sigma_s, sigma_t = sigma_s * (1.0 / self.air.scale), sigma_t * (1.0 / self.air.scale)
+        sigma_s, sigma_t = dr.select(active, sigma_s, 0.0), dr.select(active, sigma_t, 0.0)
+        return sigma_s, bound_ - sigma_t, sigma_t
+
+    def to_string(self) -> str:
+        return f"AtmosphereMedium[scale = {self.air.scale}, {self.air.atmosphere.to_dict()}]"
+
+
+def _atmosphere(props: Any) -> Atmosphere:
+    """The atmosphere of the properties, with the values that they replace."""
+    atmosphere = settings._atmosphere(props, lambda name: str(mi.file_resolver().resolve(name)))
+    return atmosphere.replace(dict(settings._overrides(props, atmosphere)))

@@ -1,0 +1,2 @@
+class Fisheye: pass
+class LatLong: pass
