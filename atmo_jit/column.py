@@ -52,8 +52,7 @@ class SunColumns:
         self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
         self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
-        if self._count:
-            self._table = self._build()
+        self._table = self._build() if self._count else None
 
     def _build(self) -> Any:
         t = types()
@@ -62,14 +61,15 @@ class SunColumns:
         row, column = lane // cosines % rows, lane % cosines
         low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
         x = t.Float(row) / self._rows
-        # Each end belongs to this shell's side of the break; at the top itself the mean would be 0 / 0.
+        # Each end belongs to this shell's side of the break.
         h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
         totals = column_up(self.optics, h, mu)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         table = dr.zeros(t.Float, dr.width(lane) * self._count)
+        at_top = self.optics.densities(h)  # where the path has no length
         for k, total in enumerate(totals):
-            mean = total / path
+            mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
             dr.scatter(table, dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean, lane * self._count + k)
         return table
 
@@ -79,6 +79,8 @@ class SunColumns:
         A ray that would pass below the ground is lifted to its horizon, the ray that grazes the ground: while the sun's centre is
         below the horizon, the part of the disc still seen is there.
         """
+        if not self._count:
+            return []
         radius = self.optics.radius
         mu = dr.maximum(mu, -dr.sqrt(h * (2.0 * radius + h)) / (radius + h))
         up = self._rising(h, dr.abs(mu), active)

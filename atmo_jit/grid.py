@@ -37,7 +37,7 @@ class Grid:
         # Samples dense near the ground, so that a thin layer there is resolved too.
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 3
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
-        rise = 0.12 * step / atmosphere.thickness_m
+        rise = 0.3 * step / atmosphere.thickness_m
         extinction = 0.0 * step
         for c in atmosphere.constituents:
             density = np.maximum(np.asarray(c.profile.density(middle)), 0.0)

@@ -17,6 +17,7 @@ from .atmosphere import Atmosphere, Constituent
 from .backend import channels, floats, parameter, types
 from .profile import Exponential, Tabulated, Tent
 
+FEW_CORNERS = 8
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 LEVELS = (
     0.5,
@@ -134,7 +135,8 @@ class Optics:
     def edge_levels_m(self) -> list[float]:
         """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top, corners of tents, steps of tables.
 
-        A tabulated profile's other corners are many and slight; they are left to the quadrature.
+        The other corners of a tabulated profile count where they are few; where they are many they are slight, and are left to
+        the quadrature.
         """
         top = self.atmosphere.thickness_m
         kinks: set[float] = set()
@@ -142,7 +144,7 @@ class Optics:
             if isinstance(profile, Tent):
                 kinks.update(profile.kinks_m)
             if isinstance(profile, Tabulated):
-                kinks.update(profile.steps_m)
+                kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
         return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
 
 

@@ -54,12 +54,12 @@ class Resolution:
         fine = tolerance < 0.005
         return cls(
             altitudes=_altitudes(atmosphere, 16 if fine else 12),
-            up=max(6, later // 2 + 5),
-            down=max(4, later // 3 + 4),
+            up=later + (4 if later > 6 else 2),
+            down=max(4, (4 * later) // 5 + 2),
             azimuths=max(later, first // 2) + 2,
             degree=later,
-            first_up=max(10, first // 2 + 4),
-            first_down=max(8, first // 2 + 2),
+            first_up=max(10, first + 2 if first > 12 else first),
+            first_down=max(8, first if first > 12 else first - 2),
             first_azimuths=first + 4,
             first_degree=first,
             phase_degree=max(16, first + 4),

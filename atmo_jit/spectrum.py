@@ -24,6 +24,8 @@ Colour matching functions, the solar spectrum and the sRGB matrix come from colo
 
 from __future__ import annotations
 
+import sys
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -38,25 +40,39 @@ SOLAR_RANGE_NM = (280.0, 4000.0)
 
 
 @cache
+def _colour() -> Any:
+    """The package colour-science.
+
+    Where matplotlib is not installed it says so in a warning and puts mocks of it into ``sys.modules``, which would make others
+    believe that matplotlib is there: no plot is drawn here, so both are undone.
+    """
+    present = set(sys.modules)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    for name in set(sys.modules) - present:
+        if type(sys.modules[name]).__name__ == "MagicMock":
+            del sys.modules[name]
+    return colour
+
+
+@cache
 def cie_1931() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths (nm, [471]) and the CIE 1931 2 degree colour matching functions x, y, z there ([471, 3])."""
-    import colour
-
-    functions = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    functions = _colour().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     return _frozen(functions.wavelengths), _frozen(functions.values)
 
 
 @cache
 def xyz_to_srgb() -> np.ndarray:
     """The [3, 3] matrix from CIE XYZ to linear sRGB (IEC 61966-2-1)."""
-    import colour
-
-    return _frozen(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
+    return _frozen(_colour().RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
 
 
 @cache
 def _smooth_solar() -> tuple[np.ndarray, np.ndarray]:
     """ASTM G173-03 extraterrestrial irradiance at whole nanometres, as a running mean over SMOOTHING_NM."""
+    _colour()
     from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
 
     data = np.array(sorted(DATA_ASTMG173_ETR.items()), dtype=np.float64)

@@ -53,12 +53,16 @@ class Air:
         for name in atmosphere.names():
             if any(name.endswith(f".{leaf}") for leaf in EXPOSED):
                 self.values[name] = exposed(given(atmosphere, name))
+        self._seen = {name: host(value) for name, value in self.values.items()}
         self.update()
 
     def update(self) -> None:
         """Take over what was written into ``values``."""
-        found = {name: host(value) for name, value in self.values.items()}
-        self.atmosphere = self.atmosphere.replace({n: float(v[0]) if len(v) == 1 else v.tolist() for n, v in found.items()})
+        now = {name: host(value) for name, value in self.values.items()}
+        changed = {name: value for name, value in now.items() if not np.array_equal(value, self._seen[name])}
+        if changed:
+            found = {n: float(v[0]) if len(v) == 1 else v.tolist() for n, v in changed.items()}
+            self.atmosphere, self._seen = self.atmosphere.replace(found), now
         if dr.is_jit_v(mi.Float):
             dr.make_opaque(*self.values.values())
         self.fixed = {name: self.wavelengths.fixed(value) for name, value in self.values.items()}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
-from twins import Slab, Twin, world
+from bench.slab import Slab
+from bench.worlds import WORLDS, world
+from twins import Twin, cosines
 
 import atmo_jit
 
@@ -126,6 +128,80 @@ def test_flat_limit(name):
     error = np.abs(got / np.concatenate(want) - 1)
     assert np.mean(error < 0.01) >= 0.95
     assert error.max() < 0.03
+
+
+# --- our own Monte Carlo, where the reference has no atmosphere ---
+
+WALK_VIEWS = np.array(
+    [
+        (0, 50, 0, 0),
+        (0, 50, 60, 30),
+        (0, 50, 87, 150),
+        (0, 84, 40, 60),
+        (5000, 50, 80, 90),
+        (12000, 70, 110, 20),
+        (75000, 50, 180, 0),
+        (75000, 70, 150, 100),
+    ],
+    float,
+)
+"""Altitude (m), sun zenith, view zenith, azimuth (deg) of the rays of WALKS."""
+
+WALKS = {
+    "small planet": [
+        [0.011809, 0.021673, 0.036099],
+        [0.046121, 0.071711, 0.099914],
+        [0.064562, 0.109155, 0.142292],
+        [0.007870, 0.014411, 0.021835],
+        [0.009498, 0.022396, 0.044691],
+        [0.078926, 0.090884, 0.099728],
+        [0.092415, 0.083271, 0.061283],
+        [0.048690, 0.046712, 0.041381],
+    ],
+    "two aerosols, five wavelengths": [
+        [0.032098, 0.042540, 0.051304, 0.061669, 0.075517],
+        [0.135178, 0.175001, 0.203983, 0.225107, 0.237647],
+        [0.090100, 0.114817, 0.132763, 0.149101, 0.160590],
+        [0.015970, 0.019699, 0.023019, 0.026638, 0.029590],
+        [0.056336, 0.072861, 0.087042, 0.103217, 0.125084],
+        [0.081077, 0.103084, 0.118728, 0.132934, 0.143455],
+        [0.063580, 0.077131, 0.086448, 0.095533, 0.105417],
+        [0.034826, 0.042575, 0.048914, 0.056153, 0.064893],
+    ],
+}
+"""Radiance by ``bench.monte_carlo.truth(WORLDS[name], views, 1_000_000, seed=7)``; sigma is below 0.16 % everywhere."""
+
+
+def walk_views() -> dict[str, np.ndarray]:
+    names = ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")
+    return dict(zip(names, WALK_VIEWS.T, strict=True))
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_other_worlds(name):
+    """Several species, profiles, wavelengths and another radius: every ray within 1 % + 3 sigma, below the horizon too."""
+    got, want = atmo_jit.sky(WORLDS[name], walk_views()).radiance, np.array(WALKS[name])
+    assert np.abs(got / want - 1).max() < 0.01 + 3 * 0.0016
+
+
+def test_monte_carlo_agrees_with_adding_and_doubling():
+    """The judge is judged: the random walk in a flat layer, orders two and up, within four standard errors."""
+    from bench.monte_carlo import MonteCarlo
+
+    moments, scattered, depth, albedo = FLAT["forward haze"]
+    twin = Twin(flat_world(moments, scattered, depth, albedo))
+    view_mu, turn, mu_0 = np.array([0.3, 0.6, 1.0]), np.array([0.0, 2.0]), 0.5
+    slab = Slab(moments, scattered, np.r_[view_mu, mu_0])
+    down, up = slab.radiance(depth, 0.0, albedo, mu_0, turn)[0], slab.radiance(0.0, depth, albedo, mu_0, turn)[1]
+    want = np.concatenate([down[:3].ravel(), up[:3].ravel()])
+    h = np.repeat([0.0, 60000.0 - 1e-3], 6)
+    zenith = np.degrees(np.arccos(np.concatenate([np.repeat(view_mu, 2), -np.repeat(view_mu, 2)])))
+    mu, mu_s, nu = cosines(60.0, zenith, np.tile(np.degrees(turn), 6))
+    mu_s = np.full(12, mu_s)
+    one = twin.single_scattering(h, mu, mu_s, nu) + twin.ground_direct(h, mu, mu_s, nu)
+    more, sigma = MonteCarlo(twin).orders_from_two({"h": h, "mu": mu, "mu_s": mu_s, "nu": nu}, 20_000)
+    assert np.all(np.abs((one + more)[:, 0] - want) < 4 * sigma[:, 0] + 1e-3 * want)
+    assert np.all(sigma[:, 0] < 0.02 * want)
 
 
 # --- energy ---

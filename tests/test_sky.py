@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from twins import WORLDS, Twin, views_of, world
+from bench.worlds import WORLDS, views_of, world
+from twins import Twin
 
 import atmo_jit
 
