@@ -49,10 +49,8 @@ class Field:
             return
         self.degree = first.degree
         self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
-        self.moments = _sum(refine.both(first.moments, suns[0]), first, refine.both(rest.moments, suns[1]), rest)
-        chi = [optics.phase_moments(k, self.degree) for k in optics.scatterers]
-        channels = range(optics.channel_count)
-        self._chi = _interleave([[chi[i][c] for c in channels] for i in range(len(chi))], self.degree)
+        self.moments = _sum(refine.both(first.moments, suns[0], first.degree), first, refine.both(rest.moments, suns[1], rest.degree), rest)
+        self._chi = optics.phase_moments(self.degree, padded(optics.channel_count))
         l_, m = pairs(self.degree)
         rows = [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
         self._recurrence, self._l = floats(rows), floats(l_)
@@ -173,16 +171,3 @@ def _sum(moments: Any, order: Order, others: Any, other: Order) -> Any:
     pair, node = lane // size % len(source), lane // (size * len(source))
     there, held = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair), dr.gather(t.UInt, uints(source >= 0), pair) > 0
     return moments + dr.gather(t.Float, others, (node * len(place) + there) * size + lane % size, held)
-
-
-def _interleave(chi: list[list[Any]], degree: int) -> Any:
-    """Moments chi[kind][channel] (buffers over l) as one buffer [l, kind, padded channel]."""
-    t = types()
-    kinds = len(chi)
-    size = padded(len(chi[0])) if kinds else 1
-    out = dr.zeros(t.Float, max((degree + 1) * kinds * size, 1))
-    l_ = dr.arange(t.UInt, degree + 1)
-    for n, per_channel in enumerate(chi):
-        for c, moments in enumerate(per_channel):
-            dr.scatter(out, moments, (l_ * kinds + n) * size + c)
-    return out

@@ -6,8 +6,9 @@ share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta),
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -17,6 +18,7 @@ from .backend import floats, parameter, types
 from .plan import Resolution
 
 _FINE = 2048
+REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 
 
@@ -27,7 +29,21 @@ class Grid:
     light is then looked up linearly. Order 1, which knows the sun's disc, is solved at ``first_theta``, several times as many suns.
     """
 
+    _known: ClassVar[OrderedDict[str, Grid]] = OrderedDict()
+
+    @classmethod
+    def of(cls, atmosphere: Atmosphere, resolution: Resolution) -> Grid:
+        """The grid for an atmosphere; the same object for atmospheres of the same shape, so that what is built on it is kept."""
+        grid = cls(atmosphere, resolution)
+        key = f"{resolution} {grid.radius_m} {grid.levels.tobytes().hex()} {grid.theta.tobytes().hex()}"
+        known = cls._known.setdefault(key, grid)
+        cls._known.move_to_end(key)
+        while len(cls._known) > REMEMBERED:
+            cls._known.popitem(last=False)
+        return known
+
     def __init__(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
+        self.resolution = resolution
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
         self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine[0])
@@ -38,21 +54,20 @@ class Grid:
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 3
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
         rise = 0.3 * step / atmosphere.thickness_m
-        extinction = 0.0 * step
+        depth = 0.0 * step
         for c in atmosphere.constituents:
             density = np.maximum(np.asarray(c.profile.density(middle)), 0.0)
-            extinction = extinction + np.max(c.extinction_per_m) * density
+            depth = depth + _rounded_depth(np.max(c.extinction_per_m) * density * step)
             share = density ** (1.0 / 3.0) * step
             if np.any(c.scattering_per_m > 0) and share.sum() > 0:
                 rise = rise + share / share.sum()
         # Light in a thick layer changes within a free path of its top and bottom, slowly between.
-        depth = extinction * step
         below = np.cumsum(depth) - 0.5 * depth
         rise = rise + depth / (1.0 + below) + depth / (1.0 + depth.sum() - below)
         u = np.concatenate([[0.0], np.cumsum(rise)])
         self._u, self._h_of_u, self.refine = u * ((count - 1) / u[-1]), h, refine
         self.h, self.levels = self.levels_at(1), self.levels_at(refine)
-        self.altitude_refinement = _cubic_refinement(count, refine, even=False)
+        self.altitude_refinement = _cubic_refinement(count, refine, mirrored=None)
 
     def levels_at(self, refine: int) -> np.ndarray:
         """Altitudes (m) at ``refine`` equal steps of u per interval of the solved ones, ascending from 0 to the top."""
@@ -74,8 +89,11 @@ class Grid:
         self.theta, self.first_theta = (
             np.interp(np.linspace(0.0, fine, n), self._sun_coordinate(theta), theta) for n in (count, first * (count - 1) + 1)
         )
-        self.sun_refinement = _cubic_refinement(count, refine, even=True)
-        self.first_sun_refinement = _cubic_refinement(first * (count - 1) + 1, refine // first, even=True)
+        self.sun_refine = refine
+        self.sun_refinement, self.first_sun_refinement = (
+            np.stack([_cubic_refinement(first * (count - 1) + 1, refine // first, mirrored=sign) for sign in (1.0, -1.0)])
+            for first in (1, first)
+        )
 
     def _sun_coordinate(self, theta: np.ndarray | float) -> np.ndarray:
         bend = np.arctan((theta - self._center) / self._width) + np.arctan(self._center / self._width)
@@ -118,16 +136,23 @@ class Grid:
         return _split(self.sun_position(mu_s), self.sources)
 
 
+def _rounded_depth(steps: np.ndarray) -> np.ndarray:
+    """Optical depths of thin layers, scaled to a total that is a power of two, 0 below 1/4: a small change moves no node."""
+    total = steps.sum()
+    return steps * (2.0 ** np.round(np.log2(total)) / total) if total > 0.25 else 0.0 * steps
+
+
 def _split(position: Any, count: int) -> tuple[Any, Any]:
     t = types()
     index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), count - 2)
     return index, position - t.Float(index)
 
 
-def _cubic_refinement(count: int, refine: int, *, even: bool) -> np.ndarray:
+def _cubic_refinement(count: int, refine: int, *, mirrored: float | None) -> np.ndarray:
     """Matrix [refine (count - 1) + 1, count]: Catmull-Rom interpolation of equidistant values at ``refine`` points per interval.
 
-    ``even``: the function is even about its first node; other ends go straight on.
+    ``mirrored``: 1 or -1 for a function even or odd about its first node (a moment cos(m phi) is (-1)^m: the sun passes through the
+    zenith); other ends go straight on.
     """
     matrix = np.zeros((refine * (count - 1) + 1, count))
     for row in range(len(matrix)):
@@ -140,8 +165,8 @@ def _cubic_refinement(count: int, refine: int, *, even: bool) -> np.ndarray:
             -0.5 * f**2 + 0.5 * f**3,
         )
         for place, weight in enumerate(weights, cell - 1):
-            if place < 0 and even:
-                matrix[row, -place] += weight
+            if place < 0 and mirrored is not None:
+                matrix[row, -place] += mirrored * weight
             elif place < 0:
                 matrix[row, 0] += 2.0 * weight
                 matrix[row, 1] -= weight

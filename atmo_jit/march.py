@@ -148,14 +148,12 @@ def march(
     nodes: int = NODES,
     single: bool = True,
     source: Source | None = None,
-    phase_degree: int | None = None,
 ) -> Light:
     """Radiance scattered toward the origin of each ray, per unit of ``optics.solar``; ground light is not included.
 
     Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's shadow.
     ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the centroid of the
-    piece's weight, which is exact for a field that is linear there. ``phase_degree``: use the Legendre series of the phase functions
-    up to that degree (None: the functions themselves).
+    piece's weight, which is exact for a field that is linear there.
     """
     t = types()
     c_count, k_count = optics.channel_count, len(optics.constituents)
@@ -170,12 +168,7 @@ def march(
     r_mu = (optics.radius + rays.h) * rays.mu
     edges = _sunlight_edges(optics, rays) if single else []
     rule = Rule(nodes)
-    phases = {
-        k: optics.phase_values(k, rays.nu)
-        if phase_degree is None
-        else optics.smoothed_phase_values(k, rays.nu, phase_degree)
-        for k in optics.scatterers
-    }
+    phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
         falling = r_mu + d < 0.0

@@ -17,9 +17,9 @@ from .field import Field
 from .gather import Gather
 from .grid import Grid
 from .optics import Optics
-from .paths import Directions
+from .paths import directions_at
 from .plan import Resolution
-from .projection import Projection
+from .projection import projection
 from .refinement import Order, Refinement, combined
 from .single_scattering import first_order
 
@@ -33,23 +33,24 @@ def solve(
     ``tolerance``. The field's sky irradiance counts one event more than its moments.
     """
     r, channels = resolution, optics.channel_count
-    fine = Directions.at_nodes(grid, r.first_up, r.first_down)
+    fine = directions_at(grid, r.first_up, r.first_down)
     suns = len(grid.first_theta)
-    project = Projection(grid, suns, fine, r.first_azimuths, r.first_degree, channels)
+    project = projection(grid, suns, fine, r.first_azimuths, r.first_degree, channels)
     moments, sky = project(first_order(optics, columns, grid, fine, r))
     zeroth = Order(moments, sky, r.first_degree, project.size).zeroth()
     refine = Refinement(grid, zeroth.numpy().reshape(-1, suns, project.size))
     first = _relative(refine.first_inverse, moments, sky, r.first_degree, project.size)
     if orders == 1:
         return Field(optics, columns, grid, refine, first, None, None, scatters=False)
-    gather = Gather(optics, grid, Directions.at_nodes(grid, r.up, r.down), r.azimuths)
-    project = Projection(grid, grid.shape[1], gather.directions, r.azimuths, r.degree, channels)
-    light, later = refine.thinned(first), []
+    gather = Gather(optics, grid, directions_at(grid, r.up, r.down), r.azimuths)
+    project = projection(grid, grid.shape[1], gather.directions, r.azimuths, r.degree, channels)
+    light, later, held = refine.thinned(first), [], []
     for _ in range(2, (orders or r.orders) + 1):
         light = _relative(refine.inverse, *project(gather(refine, light)), r.degree, project.size)
         later.append(light)
         if orders is None and len(later) >= 3:
-            weights, error = _extrapolated(np.array([order.numpy(grid) for order in later]))
+            held += [order.numpy(grid) for order in later[len(held) :]]
+            weights, error = _extrapolated(np.array(held))
             if error < 0.1 * tolerance:
                 break
     if orders is None:

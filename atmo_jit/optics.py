@@ -14,10 +14,11 @@ import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
-from .backend import channels, floats, parameter, types
+from .backend import channels, floats, parameter
 from .profile import Exponential, Tabulated, Tent
 
 FEW_CORNERS = 8
+PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 LEVELS = (
     0.5,
@@ -38,7 +39,7 @@ class Optics:
     """
 
     def __init__(self, atmosphere: Atmosphere, indices: np.ndarray) -> None:
-        self.atmosphere = atmosphere
+        self.atmosphere, self.indices = atmosphere, indices
         self.channel_count = len(indices)
         self.constituents = atmosphere.constituents
         self.radius = parameter(atmosphere.bottom_radius_m)
@@ -88,28 +89,29 @@ class Optics:
         values = {id(p): p.value(nu) for p in phases}
         return [values[id(p)] for p in phases]
 
-    def smoothed_phase_values(self, constituent: int, nu: Any, degree: int) -> list[Any]:
-        """The Legendre series of the phase function up to ``degree``, per channel: without what a coarse set of directions cannot see."""
-        t = types()
-        chi = self.phase_moments(constituent, degree)
-        count = dr.opaque(t.UInt, degree + 1, 1)
+    def phase_table(self, degree: int, size: int) -> Any:
+        """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: [node, scatterer, size]."""
+        nu = np.linspace(-1.0, 1.0, PHASE_NODES)
+        weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
+        table = np.zeros((PHASE_NODES, len(self.scatterers), size))
+        for n, k in enumerate(self.scatterers):
+            for c, moments in enumerate(self._moments(k, degree)):
+                table[:, n, c] = np.polynomial.legendre.legval(nu, weights * moments)
+        return floats(table)
 
-        def term(l_: Any, current: Any, last: Any, sums: list[Any]) -> tuple[Any, ...]:
-            n = t.Float(l_)
-            sums = [
-                dr.fma((2.0 * n + 1.0) * dr.gather(t.Float, c, l_), current, s) for c, s in zip(chi, sums, strict=True)
-            ]
-            following = ((2.0 * n + 1.0) * nu * current - n * last) / (n + 1.0)
-            return l_ + 1, following, current, sums
+    def phase_moments(self, degree: int, size: int) -> Any:
+        """Legendre moments chi_l of the scatterers: one buffer [l, scatterer, size]."""
+        table = np.zeros((degree + 1, max(len(self.scatterers), 1), size))
+        for n, k in enumerate(self.scatterers):
+            for c, moments in enumerate(self._moments(k, degree)):
+                table[:, n, c] = moments
+        return floats(table)
 
-        zero = dr.zeros(t.Float, dr.width(nu))
-        state = (t.UInt(0), zero + 1.0, zero, [zero + 0.0 for _ in chi])
-        *_, sums = dr.while_loop(state, lambda l_, *_: l_ < count, term, label="phase")
-        return [s * (0.25 / dr.pi) for s in sums]
-
-    def phase_moments(self, constituent: int, degree: int) -> list[Any]:
-        """Legendre moments chi_0..chi_degree per channel: a list of C Float buffers of length degree + 1."""
-        return [_as_buffer(p.moments(degree)) for p in self._phases[constituent]]
+    def _moments(self, constituent: int, degree: int) -> list[np.ndarray]:
+        phase = self.constituents[constituent].phase
+        phases = [phase.at(int(i)) for i in self.indices]
+        made = {id(p): p.moments(degree) for p in phases}
+        return [made[id(p)] for p in phases]
 
     @cached_property
     def breaks_m(self) -> np.ndarray:
@@ -170,14 +172,3 @@ def _phases(constituent: Constituent, indices: np.ndarray) -> list[Any]:
     phases = [constituent.phase.at(int(i)) for i in indices]
     made = {id(p): _with_parameters(p) if hasattr(p, "g") else p for p in phases}
     return [made[id(p)] for p in phases]
-
-
-def _as_buffer(moments: Any) -> Any:
-    """Moments, a NumPy array or a list of width-1 Floats, as one buffer."""
-    if isinstance(moments, np.ndarray):
-        return floats(moments)
-    t = types()
-    buffer = dr.zeros(t.Float, len(moments))
-    for index, moment in enumerate(moments):
-        dr.scatter(buffer, moment, t.UInt(index))
-    return buffer

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
-from .backend import floats, types, uints
+from .backend import types
 from .geometry import altitude_along
 from .march import FEW, MAX_DEPTH, SPENT_DEPTH
 from .optics import Optics
@@ -26,15 +25,13 @@ class PathWeights:
     """
 
     def __init__(self, optics: Optics, paths: Paths) -> None:
-        t, p = types(), paths
+        t, p, d = types(), paths, paths.device
         kinds, channels = len(optics.constituents), optics.channel_count
         node = dr.arange(t.UInt, p.count)
-        ray = uints(p.ray)
-        follows = uints(np.append(p.ray[1:] == p.ray[:-1], False))
-        distance, u = floats(p.distance), floats(p.u)
-        h, mu = dr.gather(t.Float, floats(p.h), ray), dr.gather(t.Float, floats(p.mu_start), ray)
+        ray, distance, u = d.ray, d.distance, d.u
+        h, mu = dr.gather(t.Float, d.h, ray), dr.gather(t.Float, d.mu_start, ray)
         nxt = dr.minimum(node + 1, dr.opaque(t.UInt, p.count - 1, 1))
-        start, stop = distance, dr.select(follows == 1, dr.gather(t.Float, distance, nxt), distance)
+        start, stop = distance, dr.select(d.follows == 1, dr.gather(t.Float, distance, nxt), distance)
         u_start, u_stop = u, dr.gather(t.Float, u, nxt)
         x, w = (a.tolist() for a in gauss_legendre(FEW))
         running = running_integral(FEW, tuple(x)).tolist()
@@ -44,7 +41,7 @@ class PathWeights:
             there, _ = altitude_along(optics.radius, h, mu, dr.fma(stop - start, node_x, start))
             for k, density in enumerate(optics.densities(there)):
                 own[k] = dr.fma((stop - start) * weight, density, own[k])
-        first = dr.gather(t.UInt, uints(p.first), ray)
+        first = dr.gather(t.UInt, d.first, ray)
         dr.eval(own)
 
         def add_piece(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
@@ -53,14 +50,14 @@ class PathWeights:
         zeros = [dr.zeros(t.Float, p.count) for _ in range(kinds)]
         _, before = dr.while_loop((first + 0, zeros), lambda i, _: i < node, add_piece, label="columns")
 
-        def advance(d: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> tuple[Any, ...]:
-            here, _ = altitude_along(optics.radius, h, mu, d)
+        def advance(at: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> tuple[Any, ...]:
+            here, _ = altitude_along(optics.radius, h, mu, at)
             there, _ = altitude_along(optics.radius, h, mu, stop)
             densest = dr.maximum(
                 optics.largest_extinction(optics.densities(here)), optics.largest_extinction(optics.densities(there))
             )
-            length = dr.minimum(stop - d, MAX_DEPTH / dr.maximum(densest, 1e-30))
-            points = [altitude_along(optics.radius, h, mu, dr.fma(length, node_x, d))[0] for node_x in x]
+            length = dr.minimum(stop - at, MAX_DEPTH / dr.maximum(densest, 1e-30))
+            points = [altitude_along(optics.radius, h, mu, dr.fma(length, node_x, at))[0] for node_x in x]
             density = [optics.densities(point) for point in points]
             for g in range(FEW):
                 inside = [
@@ -80,15 +77,15 @@ class PathWeights:
                         far[i] = dr.fma(share, hat, far[i])
             for k in range(kinds):
                 amounts[k] = dr.fma(length, sum(w[g] * density[g][k] for g in range(FEW)), amounts[k])
-            done = length >= stop - d
-            return dr.select(done, stop, d + length), amounts, near, far
+            done = length >= stop - at
+            return dr.select(done, stop, at + length), amounts, near, far
 
-        def unfinished(d: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> Any:
+        def unfinished(at: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> Any:
             depths = optics.optical_depths(amounts)
             thinnest = depths[0]
             for depth in depths[1:]:
                 thinnest = dr.minimum(thinnest, depth)
-            return (d < stop) & (thinnest < SPENT_DEPTH)
+            return (at < stop) & (thinnest < SPENT_DEPTH)
 
         many = len(optics.scatterers) * channels
         state = (
@@ -101,12 +98,9 @@ class PathWeights:
         has_previous = node > first
         previous = dr.maximum(node, 1) - 1
         weights = [n + dr.gather(t.Float, f, previous, has_previous) for n, f in zip(near, far, strict=True)]
-        station, factor = uints(p.station), floats(p.factor)
-        self.weights = [dr.gather(t.Float, weight, station) * factor for weight in weights]
-        last = np.append(p.ray[1:] != p.ray[:-1], True) & p.ground[p.ray]
-        on_ground = floats(last)
+        self.weights = [dr.gather(t.Float, weight, d.station) * d.factor for weight in weights]
         self.reflected = [
-            dr.gather(t.Float, dr.exp(-depth) * on_ground * albedo * dr.inv_pi, station)
+            dr.gather(t.Float, dr.exp(-depth) * d.on_ground * albedo * dr.inv_pi, d.station)
             for depth, albedo in zip(optics.optical_depths(before), optics.albedo, strict=True)
         ]
         dr.eval(self.weights, self.reflected)

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from .backend import floats, uints
 from .grid import Grid
 from .quadrature import split_directions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Directions:
     """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), ``facing_up`` [K, D]: those of the irradiance."""
 
@@ -33,7 +36,7 @@ class Directions:
         return cls(*(np.array(rows) for rows in zip(*(split_directions(m, up, down) for m in horizon), strict=True)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Paths:
     """Stations of all rays (k, direction), concatenated ray after ray: T stations in all, N rays.
 
@@ -59,6 +62,20 @@ class Paths:
     factor: np.ndarray
     first_visit: np.ndarray
     locate: Callable[[Any], tuple[Any, Any]]
+
+    @cached_property
+    def device(self) -> SimpleNamespace:
+        """Every array as a Dr.Jit buffer, and ``turns`` [visits, 2], ``follows`` (a station follows on the same ray), ``on_ground``."""
+        real = ("distance", "mu", "cos_turn", "sin_turn", "u", "h", "mu_start", "factor")
+        whole = ("first", "ray", "station", "level", "first_visit")
+        ends = np.append(self.ray[1:] != self.ray[:-1], True)
+        return SimpleNamespace(
+            **{name: floats(getattr(self, name)) for name in real},
+            **{name: uints(getattr(self, name)) for name in whole},
+            turns=floats(np.column_stack([self.cos_turn[self.station], self.sin_turn[self.station]])),
+            follows=uints(~ends),
+            on_ground=floats(ends & self.ground[self.ray]),
+        )
 
     @property
     def count(self) -> int:
@@ -126,3 +143,15 @@ class Paths:
             first_visit=np.searchsorted(station, first),
             locate=lambda altitude: grid.locate_altitude(altitude, refine),
         )
+
+
+@lru_cache(maxsize=32)
+def directions_at(grid: Grid, up: int, down: int) -> Directions:
+    """Directions at the solved altitudes, kept with the grid."""
+    return Directions.at_nodes(grid, up, down)
+
+
+@lru_cache(maxsize=32)
+def paths_along(grid: Grid, directions: Directions, refine: int) -> Paths:
+    """Paths along directions, kept with the grid."""
+    return Paths.trace(grid, directions, refine)

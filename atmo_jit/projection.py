@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -12,6 +13,12 @@ from .grid import Grid
 from .harmonics import legendre, pair_count, pairs
 from .paths import Directions
 from .quadrature import half_circle
+
+
+@lru_cache(maxsize=32)
+def projection(grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int) -> Projection:
+    """The projection for a grid, kept with it."""
+    return Projection(grid, suns, directions, azimuths, degree, channels)
 
 
 class Projection:

@@ -64,28 +64,25 @@ class Refinement:
         first = (reference.shape[1] - 1) // (grid.shape[1] - 1)
         logs = _steadied(np.log(np.maximum(reference, 1e-30)), STEEPEST / first)
         self.first_inverse, self.inverse = floats(np.exp(-logs)), floats(np.exp(-logs[:, ::first]))
-        fine = np.einsum("fs,ksc->kfc", grid.first_sun_refinement, logs)
+        fine = np.einsum("fs,ksc->kfc", grid.first_sun_refinement[0], logs)
         self.log_reference = floats(np.einsum("lk,kfc->lfc", grid.altitude_refinement, fine))
         self._first_suns, self._suns, self._altitudes = (
-            _taps(m) for m in (grid.first_sun_refinement, grid.sun_refinement, grid.altitude_refinement)
+            _taps(m) for m in (grid.first_sun_refinement, grid.sun_refinement, grid.altitude_refinement[None])
         )
 
     def altitudes(self, values: Any) -> Any:
         """[K, ...] -> [levels, ...]."""
         count = self.grid.shape[0]
-        return self._along(
-            values, self._altitudes, count, len(self.grid.levels), dr.width(values) // (count * self.size), 1
-        )
+        inner = dr.width(values) // (count * self.size)
+        return self._along(values, self._altitudes, count, len(self.grid.levels), inner, 1, None)
 
-    def suns(self, values: Any, outer: int, count: int | None = None) -> Any:
-        """[outer, S, ...] -> [outer, sources, ...]; ``count``: S, that of the solve or that of order 1."""
-        count = count or self.grid.shape[1]
-        taps = self._suns if count == self.grid.shape[1] else self._first_suns
-        return self._along(values, taps, count, self.grid.sources, dr.width(values) // (outer * count * self.size), outer)
-
-    def both(self, values: Any, suns: int) -> Any:
-        """[K, S, ...] -> [levels, sources, ...], S being ``suns``."""
-        return self.suns(self.altitudes(values), len(self.grid.levels), suns)
+    def both(self, values: Any, suns: int, degree: int | None = None) -> Any:
+        """[K, S, pairs(degree) or nothing, size] -> [levels, sources, ...], S being ``suns``: that of the solve or that of order 1."""
+        values = self.altitudes(values)
+        taps = self._suns if suns == self.grid.shape[1] else self._first_suns
+        inner = dr.width(values) // (len(self.grid.levels) * suns * self.size)
+        odd = None if degree is None else uints(pairs(degree)[1] % 2)
+        return self._along(values, taps, suns, self.grid.sources, inner, len(self.grid.levels), odd)
 
     def thinned(self, order: Order) -> Order:
         """Order 1 at the suns of the solve only."""
@@ -104,13 +101,16 @@ class Refinement:
 
         return Order(pick(order.moments), pick(order.sky), order.degree, order.size)
 
-    def _along(self, values: Any, taps: tuple[Any, Any], count: int, refined: int, inner: int, outer: int) -> Any:
-        """Interpolate the middle axis of [outer, count, inner, size]."""
+    def _along(
+        self, values: Any, taps: tuple[Any, Any], count: int, refined: int, inner: int, outer: int, odd: Any
+    ) -> Any:
+        """Interpolate the second axis of [outer, count, inner, size]; ``odd`` [inner]: 1 where a value is odd about the first node."""
         t, size = types(), self.size
         lane = dr.arange(t.UInt, outer * refined * inner)
         item, rest = lane % inner, lane // inner
         place, block = rest % refined, rest // refined
-        first, weights = dr.gather(t.UInt, taps[0], place), packet(taps[1], place, 4)
+        first = dr.gather(t.UInt, taps[0], place)
+        weights = packet(taps[1], place if odd is None else dr.fma(dr.gather(t.UInt, odd, item), refined, place), 4)
         sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(size)]
         for i, weight in enumerate(weights):
             held = packet(values, (block * count + first + i) * inner + item, size)
@@ -118,10 +118,11 @@ class Refinement:
         return stored(sums, lane, size)
 
 
-def _taps(matrix: np.ndarray) -> tuple[Any, Any]:
-    """A banded matrix as the first column and the four weights of every row."""
-    first = np.minimum(np.argmax(matrix != 0, axis=1), matrix.shape[1] - 4)
-    return uints(first), floats(np.take_along_axis(matrix, first[:, None] + np.arange(4), axis=1))
+def _taps(matrices: np.ndarray) -> tuple[Any, Any]:
+    """Banded matrices [variants, rows, columns] as the first column of every row and its four weights [variants, rows, 4]."""
+    first = np.minimum(np.argmax(np.any(matrices != 0, axis=0), axis=1), matrices.shape[2] - 4)
+    columns = np.broadcast_to(first[:, None] + np.arange(4), (len(matrices), len(first), 4))
+    return uints(first), floats(np.take_along_axis(matrices, columns, axis=2))
 
 
 def _steadied(logs: np.ndarray, steepest: float) -> np.ndarray:

@@ -7,15 +7,15 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, parameter, stored, types, uints
+from .backend import floats, packet, padded, parameter, stored, types
 from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
 from .grid import Grid
 from .march import point_along, visible_sun
-from .optics import Optics
+from .optics import PHASE_NODES, Optics
 from .path_weights import PathWeights
-from .paths import Directions, Paths
+from .paths import Directions, Paths, paths_along
 from .plan import Resolution
 from .quadrature import cosine_interpolation, half_circle
 
@@ -62,7 +62,7 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
     smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed by them.
     """
     t = types()
-    paths = Paths.trace(grid, directions, r.beam_refine)
+    paths = paths_along(grid, directions, r.beam_refine)
     weights = PathWeights(optics, paths)
     beam = Sunbeam(optics, columns, grid.levels_at(r.beam_refine))
     glow = _beam_along(optics, beam, paths, weights, grid, r.beam_azimuths)
@@ -80,17 +80,16 @@ def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeight
     mu_s = dr.gather(t.Float, floats(np.cos(grid.first_theta)), sun)
     across = dr.gather(t.Float, floats(np.sin(grid.first_theta)), sun) * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
     visits = len(paths.station)
-    turns = floats(np.column_stack([paths.cos_turn[paths.station], paths.sin_turn[paths.station]]))
+    device = paths.device
     rows = stored([weights.weights[n * channels + c] if c < channels else t.Float(0.0) for n in range(kinds) for c in range(size)] or [t.Float(0.0)], dr.arange(t.UInt, visits), max(kinds * size, 1))
-    level, first = uints(paths.level), uints(paths.first_visit)
-    start, stop = dr.gather(t.UInt, first, ray), dr.gather(t.UInt, first, ray + 1)
+    start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
 
     def turned(visit: Any) -> Any:
-        cos_turn, sin_turn = packet(turns, visit, 2)
+        cos_turn, sin_turn = packet(device.turns, visit, 2)
         return dr.fma(cos_turn, mu_s, sin_turn * across)
 
     def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        light = beam.at(dr.gather(t.UInt, level, i), turned(i))
+        light = beam.at(dr.gather(t.UInt, device.level, i), turned(i))
         weight = packet(rows, i, kinds * size)
         return i + 1, [dr.fma(weight[n * size + c], light[c], sums[n * channels + c]) for n in range(kinds) for c in range(channels)]
 
@@ -132,9 +131,16 @@ def _times_phase(optics: Optics, glow: Any, grid: Grid, directions: Directions, 
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((1 + kinds) * size)]
     _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < count, add, label="azimuths")
     values = [dr.maximum(v, 0.0) for v in sums[:channels]]
-    for n, k in enumerate(optics.scatterers, 1):
-        phase = optics.smoothed_phase_values(k, nu, r.phase_degree)
-        values = [dr.fma(dr.maximum(sums[n * size + c], 0.0), phase[c], values[c]) for c in range(channels)]
+    if kinds:
+        table = optics.phase_table(r.phase_degree, size)
+        x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
+        cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
+        f = x - t.Float(cell)
+        low, high = packet(table, cell, kinds * size), packet(table, cell + 1, kinds * size)
+        for n in range(kinds):
+            for c in range(channels):
+                i = n * size + c
+                values[c] = dr.fma(dr.maximum(sums[size + i], 0.0), dr.fma(f, high[i] - low[i], low[i]), values[c])
     return stored(values, lane, size)
 
 

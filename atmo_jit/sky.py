@@ -49,7 +49,7 @@ class _Band:
     ) -> None:
         self.optics = Optics(atmosphere, indices)
         self.columns = SunColumns(self.optics, resolution.columns)
-        self.field = solve(self.optics, self.columns, Grid(atmosphere, resolution), resolution, orders, tolerance)
+        self.field = solve(self.optics, self.columns, Grid.of(atmosphere, resolution), resolution, orders, tolerance)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 

@@ -17,12 +17,15 @@ from atmo_jit.atmosphere import Atmosphere, Constituent
 from atmo_jit.phase import CornetteShanks, HenyeyGreenstein
 from atmo_jit.profile import Exponential, Profile, Tent
 
+from .exposed import array, host
 from .wavelengths import Wavelengths
 
 # Cells of the majorant's table, spaced by the square root of altitude: 0.2 m at the ground of the earth, 230 m at its top.
 MAJORANT_CELLS = 512
 # The majorant is this much larger than the largest extinction, so that rounding of altitudes never turns null collisions negative.
 MAJORANT_MARGIN = 1e-4
+# Of an altitude far from the planet, in float32: relative to (r^2 - R^2) / R.
+ROUNDING = 3e-7
 # The values of a description that are exposed; all of them are differentiable.
 EXPOSED = (
     "scattering_per_m",
@@ -52,7 +55,7 @@ class Air:
         self.values: dict[str, Any] = {}
         for name in atmosphere.names():
             if any(name.endswith(f".{leaf}") for leaf in EXPOSED):
-                self.values[name] = exposed(given(atmosphere, name))
+                self.values[name] = array(given(atmosphere, name))
         self._seen = {name: host(value) for name, value in self.values.items()}
         self.update()
 
@@ -103,15 +106,17 @@ class Air:
         hits &= (h <= self.thickness) | (b < 0.0)
         excess = h * (2.0 * self.radius + h) - b2
         perigee = excess / (dr.safe_sqrt(excess + self.radius * self.radius) + self.radius)
-        lowest = dr.select(b < 0.0, perigee, h)
+        # Below what rounding may have made of it: a majorant that is too small is worse than one that is too large.
+        lowest = dr.select(b < 0.0, perigee, h) - ROUNDING * (1.0 + dr.abs(h) * (2.0 + dr.abs(h) * (1.0 / self.radius)))
         return hits, dr.maximum(near, 0.0) * self.scale, far * self.scale, dr.clip(lowest, 0.0, self.thickness)
 
     # ---- coefficients
 
     def densities(self, h: Any) -> list[Any]:
-        """Relative density of each constituent at altitude ``h`` (m); below the ground it stays what it is there."""
+        """Relative density of each constituent at altitude ``h`` (m); 0 below the ground (:mod:`.planet` says why)."""
         above = dr.maximum(h, 0.0)
-        return [mi.Float(self._profile(c).density(above)) for c in self.atmosphere.constituents]
+        found = [mi.Float(self._profile(c).density(above)) for c in self.atmosphere.constituents]
+        return [dr.select((h >= 0.0) & (h <= self.thickness), density, 0.0) for density in found]
 
     def _profile(self, c: Constituent) -> Profile:
         """The profile with the exposed values, which may carry gradients."""
@@ -191,13 +196,3 @@ def given(atmosphere: Atmosphere, name: str) -> Any:
         node = node[int(key)] if isinstance(node, list) else node[key]
     return node
 
-
-def exposed(value: Any) -> Any:
-    """Numbers in an array type that ``mi.traverse`` can write to in every variant."""
-    kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf
-    return kind([float(v) for v in np.atleast_1d(np.asarray(value, dtype=np.float64))])
-
-
-def host(value: Any) -> np.ndarray:
-    """The numbers of an exposed value, float64."""
-    return np.array(dr.detach(value), dtype=np.float64).ravel()

@@ -14,8 +14,9 @@ from atmo_jit.errors import AtmosphereError
 def values(texture: Any, wavelengths_nm: np.ndarray) -> np.ndarray:
     """Reflectance [W] of a texture that does not vary in space, in the current variant.
 
-    Spectral variants evaluate it; in rgb variants a colour that is not grey becomes a smooth spectrum by the same model that Mitsuba's spectral
-    variants use for sRGB reflectances (Jakob and Hanika 2019). Raises AtmosphereError for a texture that varies in space.
+    Spectral variants evaluate it; in rgb variants a colour that is not grey becomes a smooth spectrum by the same
+    model that Mitsuba's spectral variants use for sRGB reflectances (Jakob and Hanika 2019). Raises AtmosphereError
+    for a texture that varies in space.
     """
     if texture.is_spatially_varying():
         raise AtmosphereError("albedo", "a texture that varies in space", "a number, a colour or a spectrum")

@@ -13,7 +13,8 @@ LONGEST_GAP = 4096
 
 
 def sphere(scene: Any) -> tuple[Any, float]:
-    """Centre and radius of a sphere around ``scene``, or, without one, around all shapes that are loaded in this variant.
+    """Centre and radius of a sphere around ``scene``, or, without one, around all shapes that are loaded in this
+    variant.
 
     A larger sphere than necessary only costs particles that miss. Raises RuntimeError in scalar variants without a
     scene: there is no list of shapes.

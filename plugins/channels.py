@@ -1,7 +1,8 @@
 """From W wavelengths to the channels of a Mitsuba variant, and the table look-ups that differ between variants.
 
 - rgb: three channels, linear sRGB; mono: one, the luminance. Both are constant linear maps of the W radiances.
-- spectral: the tables keep radiance / solar irradiance at the atmosphere's wavelengths; a look-up interpolates between them and multiplies
+- spectral: the tables keep radiance / solar irradiance at the atmosphere's wavelengths; a look-up interpolates
+  between them and multiplies
   with the solar spectrum (:mod:`atmo_jit.spectrum` has the rule, which is the one behind the rgb values too).
 """
 
@@ -15,7 +16,8 @@ import numpy as np
 
 from atmo_jit.spectrum import SpectralBasis, interpolation_weights
 
-from .lookup import number, texture
+from .exposed import number
+from .lookup import texture
 
 
 class Channels:
@@ -45,7 +47,10 @@ class Channels:
             self.luminance = np.ones(1)
 
     def tensor(self, values: list[Any], shape: tuple[int, ...]) -> Any:
-        """Table [*shape, C], or [*shape, C, 1] in spectral variants, from W Dr.Jit Floats; keeps gradients where the types allow it."""
+        """Table [*shape, C], in spectral variants [*shape, C, 1], from W Dr.Jit Floats.
+
+        Keeps gradients where the solver's types are the variant's.
+        """
         trailing = (1,) if mi.is_spectral else ()
         count = len(self.matrix)
         full = (*shape, count, *trailing)
@@ -53,8 +58,8 @@ class Channels:
             lane = dr.arange(mi.UInt32, int(np.prod(shape)))
             array = dr.zeros(mi.Float, len(lane) * count)
             for c, row in enumerate(self.matrix):
-                channel = sum(number(m) * v for m, v in zip(row, values, strict=True) if m != 0.0) + dr.zeros(mi.Float, len(lane))
-                dr.scatter(array, channel, lane * count + c)
+                parts = [number(m) * v for m, v in zip(row, values, strict=True) if m != 0.0]
+                dr.scatter(array, sum(parts, dr.zeros(mi.Float, len(lane))), lane * count + c)
             return mi.TensorXf(array, full)
         stacked = np.stack([np.array(v, dtype=np.float64) for v in values], axis=-1) @ self.matrix.T
         return mi.TensorXf(np.ascontiguousarray(stacked.reshape(full), dtype=np.float32))

@@ -10,6 +10,8 @@ import mitsuba as mi
 from atmo_jit.errors import AtmosphereError, shown
 from atmo_jit.phase import CornetteShanks, HenyeyGreenstein
 
+from .exposed import array, single
+
 
 class CornetteShanksPhase:
     r"""
@@ -58,8 +60,7 @@ the root of a quartic that loses its digits in single precision.)
         if not -1.0 < g < 1.0:
             raise AtmosphereError("g", shown(g), "a number in (-1, 1)")
         self.m_flags = mi.PhaseFunctionFlags.Anisotropic
-        # An array also in scalar variants, so that mi.traverse can write to it.
-        self._values = mi.Float(g) if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf([g])
+        self._values = array(g)
         self.parameters_changed()
 
     def traverse(self, callback: Any) -> None:
@@ -71,7 +72,7 @@ the root of a quartic that loses its digits in single precision.)
 
     @property
     def _g(self) -> Any:
-        return self._values if dr.is_jit_v(mi.Float) else self._values[0]
+        return single(self._values)
 
     def sample(self, ctx: Any, mei: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any, Any]:
         nu = henyey_greenstein_cosine(self._g, sample2[0])

@@ -1,7 +1,7 @@
 """The panorama in the types of a Mitsuba variant: look-up and importance sampling of sky and sun.
 
-Textures serve as arrays here because they are the one kind of table that scalar and vectorised variants read alike. Everything
-works in the emitter's local frame (Z up) and in the current variant.
+Textures serve as arrays here because they are the one kind of table that scalar and vectorised variants read alike.
+Everything works in the emitter's local frame (Z up) and in the current variant.
 """
 
 from __future__ import annotations
@@ -13,21 +13,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, Disc, Panorama, Warp, mean_of_corners
+from .exposed import number
+from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, SUN_COLUMNS, SUN_ROWS, Disc, Panorama, Warp, mean_of_corners
 
 ROWS = ROWS_DOWN + ROWS_UP
-# Importance of a cell: luminance times this. Surfaces that see the zenith see it at a better angle than the horizon; those that see the ground
-# find it by sampling their BSDF, since it has no small bright features.
+# Importance of a cell: luminance times 1 at the zenith, falling to this at the horizon, which most surfaces see at a
+# worse angle. Surfaces that see the ground find it by sampling their BSDF, since it has no small bright features; it
+# gets a small share of the sky's samples at most. Both from the noise on planes of all slopes under ``path``.
 HORIZON_IMPORTANCE = 0.5
 GROUND_SHARE = 0.015
+# Importance of a sun on the horizon, and the sine of the elevation from which it counts in full.
 LOW_SUN_IMPORTANCE, FULL_IMPORTANCE_SINE = 0.3, 0.25
-# Share of the sky's samples that is spread evenly, so that no direction has density 0 (night, black sky seen from space).
+# Share of the sky's samples that is spread evenly, so that no direction has density 0 (night, black sky seen from
+# space).
 EVEN_SHARE = 0.005
-
-
-def number(x: float) -> Any:
-    """``x`` in the variant's type, read from memory so that kernels do not depend on its value."""
-    return dr.opaque(mi.Float, float(x)) if dr.is_jit_v(mi.Float) else float(x)
 
 
 def texture(values: Any, *, nearest: bool = False) -> Any:
@@ -86,15 +85,15 @@ class SkyLookup:
         return a <= self.highest
 
     def place(self, a: Any, phi: Any) -> tuple[Any, Any, Any]:
-        """Columns, row below the horizon and row above it, each as a fraction in [0, 1] counted from the sun or from the horizon."""
+        """Column, row below the horizon and row above it: fractions in [0, 1] from the sun or from the horizon."""
         height = dr.abs(a)
         return self.around(phi), self.down(height), self.up(height)
 
-    def node(self, a: Any, place: tuple[Any, Any, Any]) -> Any:
+    def node(self, a: Any, place: tuple[Any, Any, Any]) -> tuple[Any, Any]:
         """Texture coordinates (column, row) for interpolation between nodes."""
         u, down, up = place
         row = dr.select(a >= 0.0, dr.fma(up, ROWS_UP, ROWS_DOWN + 1.5), dr.fma(down, -ROWS_DOWN, ROWS_DOWN + 0.5))
-        return mi.Point2f(dr.fma(u, COLUMNS, 0.5) / (COLUMNS + 1), row / (ROWS + 2))
+        return dr.fma(u, COLUMNS, 0.5) / (COLUMNS + 1), row / (ROWS + 2)
 
     def pdf(self, a: Any, place: tuple[Any, Any, Any], active: Any) -> Any:
         """Density per solid angle (1/sr) of :meth:`sample`."""
@@ -120,7 +119,7 @@ class SkyLookup:
 
 
 def importance(view: Panorama, luminance: np.ndarray) -> tuple[np.ndarray, float]:
-    """Sampling weights of the cells, and what the sky gives a surface that competes with the sun (see :func:`sun_share`)."""
+    """Sampling weights of the cells, and their sum, which competes with the sun in :func:`sun_share`."""
     flux = mean_of_corners(np.maximum(luminance, 0.0)) * view.solid_angles()
     sines = np.delete(0.5 * (view.cells()[0][1:] + view.cells()[0][:-1]), ROWS_DOWN)[:, None]
     weight = flux * (HORIZON_IMPORTANCE + (1.0 - HORIZON_IMPORTANCE) * np.clip(sines, 0.0, 1.0))
@@ -142,13 +141,11 @@ class SunLookup:
         self.density = number(1.0 / disc.solid_angle)
 
     def distance2(self, d: Any, sun: Any) -> Any:
-        """Squared distance of ``d`` from the centre, 1 at the limb: from the chord, since 1 - cos would be lost in single precision."""
+        """Squared distance of ``d`` from the centre, 1 at the limb: by the chord, as single precision loses 1 - cos."""
         return dr.squared_norm(d - sun) * self.inverse_chord2
 
     def node(self, a: Any, distance2: Any) -> tuple[Any, Any]:
         """Texture coordinates (distance, elevation) between the first and the last texel's centre."""
-        from .panorama import SUN_COLUMNS, SUN_ROWS
-
         x, y = dr.clip(distance2, 0.0, 1.0), dr.clip((a - self.low) * self.scale, 0.0, 1.0)
         return dr.fma(x, SUN_COLUMNS - 1, 0.5) / SUN_COLUMNS, dr.fma(y, SUN_ROWS - 1, 0.5) / SUN_ROWS
 
@@ -161,9 +158,11 @@ class SunLookup:
 
 
 def sun_share(sun: float, sky: float, sine: float) -> float:
-    """Probability of sampling the sun, given the luminous irradiance across its beam, the sky's flux and the sine of its elevation.
+    """Probability of sampling the sun, given the luminous irradiance across its beam, the sky's flux and the sine of
+    its elevation.
 
-    Below 15 degrees the sun counts for less: surfaces that face it have noise to spare, the ground does not. 0 without a sun.
+    Below 15 degrees the sun counts for less: surfaces that face it have noise to spare, the ground does not. 0
+    without a sun.
     """
     high = min(max(sine, 0.0) / FULL_IMPORTANCE_SINE, 1.0)
     weight = sun * (LOW_SUN_IMPORTANCE + (1.0 - LOW_SUN_IMPORTANCE) * high)

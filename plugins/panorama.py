@@ -1,11 +1,12 @@
 """The sky around one observer as a small table: where its nodes lie, and the radiance there.
 
-Coordinates: ``a``, elevation above the geometric horizon (rad, negative on the ground); ``phi``, azimuth from the sun in [0, pi]
-(the sky is symmetric). A direction belongs to the upper or the lower part of the table; nothing is interpolated across the horizon,
-so the ground starts with an edge. Nodes crowd where radiance varies: at the horizon on both sides, and around the sun.
+Coordinates: ``a``, elevation above the geometric horizon (rad, negative on the ground); ``phi``, azimuth from the sun
+in [0, pi] (the sky is symmetric). A direction belongs to the upper or the lower part of the table; nothing is
+interpolated across the horizon, so the ground starts with an edge. Nodes crowd where radiance varies: at the horizon
+on both sides, and around the sun.
 
-Everything that depends on a Mitsuba variant is elsewhere: this module uses NumPy for positions and the solver's own Dr.Jit types for
-radiance, so that a derivative can pass from the parameters into the table.
+Everything that depends on a Mitsuba variant is elsewhere: this module uses NumPy for positions and the solver's own
+Dr.Jit types for radiance, so that a derivative can pass from the parameters into the table.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-# Rows above and below the horizon, columns from the sun to its opposite. Interpolation error against the solver at random directions:
-# see tests/plugins/test_panorama.py.
+# Rows above and below the horizon, columns from the sun to its opposite. Interpolation error against the solver at
+# random directions: see tests/plugins/test_panorama.py.
 ROWS_UP, ROWS_DOWN, COLUMNS = 128, 64, 72
 SUN_ROWS, SUN_COLUMNS = 49, 17
 AUREOLE_RAD = math.radians(1.0)
@@ -30,8 +31,8 @@ EDGE_RAD = 2e-6
 class Warp:
     """A smooth increasing map of [0, length] onto [0, 1] that is steep around its centres.
 
-    u(x) = linear x + sum_k gain_k (asinh((x - centre_k) sharpness_k) + asinh(centre_k sharpness_k)): spacing proportional to the distance from
-    a centre beyond 1 / sharpness, constant within it.
+    u(x) = linear x + sum_k gain_k (asinh((x - centre_k) sharpness_k) + asinh(centre_k sharpness_k)): the spacing of
+    nodes grows with the distance from a centre beyond 1 / sharpness and is constant within it.
     """
 
     length: float
@@ -85,8 +86,8 @@ class Panorama:
     def of(cls, radius_m: float, thickness_m: float, altitude_m: float, sun_zenith: float) -> Panorama:
         """The table of a planet of ``radius_m`` with air up to ``thickness_m``.
 
-        ``dip``: how far the horizon lies below the horizontal, acos(R / (R + h)) without cancellation. From above the air the table ends at
-        the top of the limb: the rest of the sky is black.
+        ``dip``: how far the horizon lies below the horizontal, acos(R / (R + h)) without cancellation. From above the
+        air the table ends at the top of the limb: the rest of the sky is black.
         """
         distance = math.sqrt(altitude_m * (2.0 * radius_m + altitude_m))
         dip = math.atan2(distance, radius_m)
@@ -96,7 +97,8 @@ class Panorama:
             top = radius_m + thickness_m
             highest = max(dip - math.atan2(math.sqrt(above * (2.0 * top + above)), top), 4.0 * EDGE_RAD)
         sun_height = min(max(horizon - sun_zenith, 0.0), highest)
-        # Seen from space the air is a thin line on the horizon: two kilometres of it set the scale there, 0.2 degrees near the ground.
+        # Seen from space the air is a thin line on the horizon: two kilometres of it set the scale there, 0.2 degrees
+        # near the ground.
         haze = min(math.radians(0.2), 2000.0 / max(distance, 1.0))
         up = Warp.around(highest, (0.0, haze, 0.4), (sun_height, AUREOLE_RAD, 0.25))
         # Below the horizon radiance follows the distance to the ground, which changes on the scale of the dip.
@@ -117,7 +119,7 @@ class Panorama:
         return self.horizon_zenith - self.sun_zenith
 
     def rows(self) -> np.ndarray:
-        """``a`` at the table's rows [ROWS_DOWN + 1 + ROWS_UP + 1]: from nadir up to the horizon, from the horizon to the zenith or limb."""
+        """``a`` at the rows [ROWS_DOWN + 1 + ROWS_UP + 1]: nadir to horizon, then horizon to zenith (or limb)."""
         return np.concatenate([-self.down.nodes(ROWS_DOWN + 1)[::-1], self.up.nodes(ROWS_UP + 1)])
 
     def columns(self) -> np.ndarray:
@@ -125,14 +127,14 @@ class Panorama:
         return self.around.nodes(COLUMNS + 1)
 
     def directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """View zenith and azimuth (rad) of all nodes, float64, flattened row by row; the rows at the horizon stand EDGE_RAD off it."""
+        """View zenith and azimuth (rad) of all nodes, float64, by rows; those at the horizon are EDGE_RAD off it."""
         a = self.rows()
         a[ROWS_DOWN], a[ROWS_DOWN + 1] = -EDGE_RAD, EDGE_RAD
         zenith, azimuth = np.meshgrid(self.horizon_zenith - a, self.columns(), indexing="ij")
         return zenith.ravel(), azimuth.ravel()
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:
-        """Edges of the sampling cells: sine of elevation at the rows, azimuth at the columns (the rows at the horizon coincide)."""
+        """Edges of the sampling cells: sine of elevation at the rows (the horizon twice), azimuth at the columns."""
         return np.sin(self.rows() - self.dip), self.columns()
 
     def solid_angles(self) -> np.ndarray:
@@ -143,7 +145,7 @@ class Panorama:
 
 
 def mean_of_corners(values: np.ndarray) -> np.ndarray:
-    """Mean of a cell's four nodes: [rows, columns, ...] -> [ROWS_DOWN + ROWS_UP, COLUMNS, ...]; no cell spans the horizon."""
+    """Mean of a cell's four nodes: [rows, columns] -> [ROWS_DOWN + ROWS_UP, COLUMNS]; no cell spans the horizon."""
     rows = np.delete(0.5 * (values[1:] + values[:-1]), ROWS_DOWN, axis=0)
     return 0.5 * (rows[:, 1:] + rows[:, :-1])
 
@@ -163,11 +165,13 @@ def solve_sky(sky: Any, view: Panorama, altitude_m: Any = None, sun_zenith: Any 
 
 @dataclass(frozen=True)
 class Disc:
-    """The sun's disc: seen between ``low`` and ``high`` (rad above the horizon), its brightness there relative to an unattenuated, even one.
+    """The sun's disc: seen between ``low`` and ``high`` (rad above the horizon), its brightness there relative to an
+    unattenuated, even one.
 
-    ``low`` >= ``high``: it has set. ``brightness`` [SUN_ROWS, SUN_COLUMNS, W]: along elevation from ``low`` to ``high``, and along the square of
-    the distance from the centre (0 centre, 1 limb); without limb darkening all columns are equal. ``mean`` [W]: the mean over the
-    whole disc, which is the fraction of the sun's irradiance that arrives.
+    ``low`` >= ``high``: it has set. ``brightness`` [SUN_ROWS, SUN_COLUMNS, W]: along elevation from ``low`` to
+    ``high``, and along the square of the distance from the centre (0 centre, 1 limb); without limb darkening all
+    columns are equal. ``mean`` [W]: the mean over the whole disc, which is the fraction of the sun's irradiance that
+    arrives.
     """
 
     radius: float
@@ -185,8 +189,8 @@ class Disc:
 def solve_disc(sky: Any, view: Panorama, radius: float, limb_darkening: bool = False) -> Disc:
     """Transmittance towards the visible part of a disc of angular ``radius`` (rad); dark below the horizon.
 
-    Limb darkening after Hestroffer and Magnan, A&A 333 (1998): brightness mu^alpha, alpha = -0.023 + 0.292 / lambda (micrometres), scaled
-    so that the disc's irradiance does not change.
+    Limb darkening after Hestroffer and Magnan, A&A 333 (1998): brightness mu^alpha, alpha = -0.023 + 0.292 / lambda
+    (micrometres), scaled so that the disc's irradiance does not change.
     """
     wavelengths = np.asarray(sky.atmosphere.wavelengths_nm)
     low = max(view.sun_height - radius, EDGE_RAD)
@@ -214,7 +218,7 @@ def solve_disc(sky: Any, view: Panorama, radius: float, limb_darkening: bool = F
 
 
 def _together(*values: Any) -> list[Any]:
-    """NumPy arrays, numbers and Dr.Jit numbers as evaluated Float64 arrays of one width (literals would end up in the kernels)."""
+    """Arrays and numbers as evaluated Float64 arrays of one width: literals would be compiled into the kernels."""
     from atmo_jit.backend import doubles, types
 
     count = max(len(np.atleast_1d(v)) for v in values if not dr.is_array_v(v))

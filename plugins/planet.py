@@ -5,65 +5,84 @@
     from atmo_jit.plugins import register
     from atmo_jit.plugins.planet import planet
     register()
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "volpath", "max_depth": -1},
-                          **planet("earth", sun_direction=[0, 0.9, 0.4]), "sensor": {...}})
+    earth = planet("earth", sun_direction=[0, 0.9, 0.4])
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "volpath", "max_depth": -1}, **earth,
+                          "sensor": {"type": "fisheye", "medium": earth["air"]}})
 
-The scene's origin lies ``altitude_m`` above the ground, z is up there. What single precision does to a sphere of the size of the
-earth, and what is done about it:
+The scene's origin lies ``altitude_m`` above the ground, and z is up there. The medium knows where it ends, so no shape encloses
+it: the camera is in it, be it in the air or in space. What single precision does to a scene of this size, and what is
+done about it:
 
-- Points on it are known to 0.5 m, and Mitsuba starts a reflected ray 9e-5 of the largest coordinate above them. Nearer than some
-  16 km to the scene's origin that is less than their error, and the ground shadows itself. There the ground is a mesh, whose
-  points near the origin are exact (``CAP_RADIUS_M``), and the sphere lies ``CAP_GAP_M`` below it.
-- Far away the same offset is large: 9 m at 100 km, 90 m at 1000 km. It raises the start of light reflected there, which
-  matters to 0.1 % of what the ground reflects at 100 km.
-- The top of the atmosphere is a sphere with a ``null`` BSDF; its error of 0.5 m does not matter, since the medium ends
-  where the atmosphere does whatever the sphere's rounding.
+- Mitsuba starts a ray that leaves a surface 9e-5 of the largest coordinate above it: 0.1 mm beside the origin, 90 m at a
+  distance of 1000 km. In haze those 90 m are 1 % of what the ground reflects. Therefore the ground lies as much lower
+  as rays start higher, with nothing in between: the air begins at altitude 0 whatever the ground's own altitude is.
+- A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of the planet would pass
+  it 100 m lower.
+- Points of a sphere of the earth's size are known to 0.5 m, which is more than that offset at up to 16 km from the origin: the
+  ground would shadow itself. A mesh, whose points near the origin are exact, is the ground up to ``MESH_RADIUS_M``.
 """
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.errors import AtmosphereError, shown
+from atmo_jit.spectrum import SpectralBasis
 
 from . import plugin_class
+from .variants import bound
 
-CAP_RADIUS_M = 25e3
-CAP_GAP_M = 4.0
-CAP_SECTORS = 96
-CAP_STEP = 1.08  # ratio of the radii of neighbouring rings: facets sink less than 0.1 m below the sphere
+SUNS = ("unit", "solar", "colour")
+MESH_RADIUS_M = 1500e3
+SECTORS = 96
+STEP = 1.08  # ratio of the radii of neighbouring rings of vertices
+SPHERE_DEPTH = 1e-4  # of the sphere that is the rest of the ground, in planet radii
 
 
-def cap_mesh(radius_m: float, altitude_m: float, scale: float, bsdf: Any) -> Any:
-    """The ground around the scene's origin: rings of vertices on the planet's sphere, with its normals."""
-    reach = min(CAP_RADIUS_M, 0.2 * radius_m)
-    rings = np.concatenate([[0.0], np.geomspace(1.0, reach, math.ceil(math.log(reach) / math.log(CAP_STEP)) + 1)])
+def ground_mesh(radius_m: float, altitude_m: float, scale: float, up: np.ndarray, bsdf: Any) -> Any:
+    """The ground around the scene's origin: rings of vertices below the planet's sphere, with its normals."""
+    reach = min(MESH_RADIUS_M, 0.25 * radius_m)
+    rings = np.concatenate([[0.0], np.geomspace(1.0, reach, math.ceil(math.log(reach) / math.log(STEP)) + 1)])
     angle = rings / radius_m
-    turn = 2.0 * math.pi * np.arange(CAP_SECTORS) / CAP_SECTORS
-    across = radius_m * np.sin(angle)
-    down = 2.0 * radius_m * np.sin(0.5 * angle) ** 2
-    x, y = np.outer(across, np.cos(turn)), np.outer(across, np.sin(turn))
-    z = np.repeat(-altitude_m - down[:, None], CAP_SECTORS, axis=1)
-    vertices = scale * np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    sine = np.sin(angle)[:, None]
-    normals = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.repeat(np.cos(angle)[:, None], CAP_SECTORS, 1)], -1)
-    i, j = np.meshgrid(np.arange(len(rings) - 1), np.arange(CAP_SECTORS), indexing="ij")
-    k = (j + 1) % CAP_SECTORS
-    a, b, c, d = (row * CAP_SECTORS + column for row, column in ((i, j), (i + 1, j), (i + 1, k), (i, k)))
-    faces = np.concatenate([np.stack([a, b, c], -1)[:].reshape(-1, 3), np.stack([a, c, d], -1)[1:].reshape(-1, 3)])
+    # Facets sink further below the sphere than their vertices; that does no harm.
+    depth = 1.01 * mi.math.RayEpsilon * (1.0 / scale + np.maximum(rings, altitude_m + rings * angle))
+    turn = 2.0 * math.pi * np.arange(SECTORS) / SECTORS
+    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
+    normals = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.broadcast_to(cosine, (len(rings), SECTORS))], -1)
+    vertices = (radius_m - depth)[:, None, None] * normals
+    # z = (R - depth) cos(angle) - R - altitude without the cancellation.
+    vertices[..., 2] = (-altitude_m - 2.0 * radius_m * np.sin(0.5 * angle) ** 2 - depth * np.cos(angle))[:, None]
+    vertices, normals = vertices @ frame(up), normals @ frame(up)
+    i, j = np.meshgrid(np.arange(len(rings) - 1), np.arange(SECTORS), indexing="ij")
+    k = (j + 1) % SECTORS
+    a, b, c, d = (row * SECTORS + column for row, column in ((i, j), (i + 1, j), (i + 1, k), (i, k)))
+    outer, inner = np.stack([a, b, c], -1), np.stack([a, c, d], -1)[1:]  # the innermost ring is a point
+    faces = np.concatenate([outer.reshape(-1, 3), inner.reshape(-1, 3)])
     props = mi.Properties()
     props["bsdf"] = bsdf
-    mesh = mi.Mesh("cap", len(vertices), len(faces), props=props, has_vertex_normals=True)
+    mesh = mi.Mesh("ground", len(vertices) * SECTORS, len(faces), props=props, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = vertices.ravel().astype(np.float32)
+    parameters["vertex_positions"] = (scale * vertices).ravel().astype(np.float32)
     parameters["vertex_normals"] = normals.ravel().astype(np.float32)
     parameters["faces"] = faces.ravel().astype(np.uint32)
     parameters.update()
     return mesh
+
+
+def frame(up: np.ndarray) -> np.ndarray:
+    """Rows x, y, z of a right-handed frame with z along the unit vector ``up``."""
+    across = np.eye(3)[int(np.argmin(np.abs(up)))]
+    x = np.cross(np.cross(up, across), up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
 
 
 def planet(
@@ -71,38 +90,70 @@ def planet(
     *,
     sun_direction: Any,
     altitude_m: float = 0.0,
+    up: Any = (0.0, 0.0, 1.0),
     scale: float = 1.0,
-    irradiance: float = 1.0,
-    wavelength_mode: str = "channels",
-    channels: list[int] | None = None,
+    sun: str = "unit",
+    sun_radius_deg: float = 0.0,
+    channels: Sequence[int] | None = None,
 ) -> dict[str, Any]:
-    """Medium, ground, top and sun for ``mi.load_dict``.
+    """The air (``air``), the ground (``ground``, ``planet``) and the sun (``sun``) for ``mi.load_dict``.
 
-    sun_direction: towards the sun; irradiance: of the sun in every channel.
+    atmosphere: anything that ``Atmosphere.load`` takes.
+    sun_direction: towards the sun, in the scene; any length.
+    altitude_m: of the scene's origin above the ground.
+    up: direction away from the planet's centre at the origin.
+    scale: scene units per metre.
+    sun: what light the sun gives. ``"unit"``: irradiance 1 in every channel, so that a picture is radiance in 1/sr, each channel at its
+        own wavelength (see ``channels`` of ``atmosphere_medium``). ``"solar"``: the same with the atmosphere's irradiance at that
+        wavelength. ``"colour"``: the colours of the emitter ``atmosphere``; then every path has one of the wavelengths, according to
+        its time, and the sensor needs ``shutter_open`` 0 and ``shutter_close`` 1 (spectral variants: any shutter).
+    sun_radius_deg: angular radius of the sun's disc, 0 for parallel light.
+    channels: as for ``atmosphere_medium``.
     """
     atmosphere = Atmosphere.load(atmosphere)
+    if sun not in SUNS:
+        raise AtmosphereError("sun", shown(sun), f"one of {', '.join(SUNS)}")
+    up_, to_sun = (np.array(v, dtype=np.float64) for v in (up, sun_direction))
+    up_, to_sun = up_ / np.linalg.norm(up_), to_sun / np.linalg.norm(to_sun)
     radius = atmosphere.bottom_radius_m
-    center = [0.0, 0.0, -(radius + altitude_m) * scale]
+    center = -(radius + altitude_m) * scale * up_
     props = mi.Properties("atmosphere_medium")
-    props["atmosphere"] = __import__("json").dumps(atmosphere.to_dict())
-    props["center"] = mi.ScalarPoint3f(center)
-    props["scale"] = scale
-    props["wavelength_mode"] = wavelength_mode
+    props["atmosphere"] = json.dumps(atmosphere.to_dict())
+    props["center"], props["scale"] = mi.ScalarPoint3f(center), scale
+    props["wavelength_mode"] = "time" if sun == "colour" else "channels"
     if channels is not None:
-        props["channels"] = ",".join(map(str, channels))
+        props["channels"] = ", ".join(map(str, channels))
     air = plugin_class("atmosphere_medium")(props)
-    albedo = float(atmosphere.ground_albedo[0])
-    bsdf = mi.load_dict({"type": "diffuse", "reflectance": {"type": "uniform", "value": albedo}})
+    wavelengths = air.air.wavelengths
+
+    reflectance = class_of("PerWavelength", "Texture")(mi.Properties())
+    reflectance.use(atmosphere.ground_albedo, wavelengths)
+    bsdf = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
+    light = class_of("Sun", "Emitter")(mi.Properties())
+    ones = np.ones_like(atmosphere.solar_irradiance)
+    irradiance = ones if sun == "unit" else atmosphere.solar_irradiance
+    basis = SpectralBasis.of(atmosphere) if sun != "unit" else SpectralBasis(atmosphere.wavelengths_nm, ones)
+    light.shine(to_sun, sun_radius_deg, irradiance, wavelengths, basis if sun == "colour" or mi.is_spectral else None)
     return {
         "air": air,
-        "ground": {"type": "sphere", "center": center, "radius": (radius - CAP_GAP_M) * scale, "bsdf": bsdf},
-        "near_ground": cap_mesh(radius, altitude_m, scale, bsdf),
-        "top": {
-            "type": "sphere", "center": center, "radius": atmosphere.top_radius_m * scale,
-            "bsdf": {"type": "null"}, "interior": air,
+        "ground": ground_mesh(radius, altitude_m, scale, up_, bsdf),
+        "planet": {
+            "type": "sphere",
+            "center": center.tolist(),
+            "radius": radius * (1.0 - SPHERE_DEPTH) * scale,
+            "bsdf": bsdf,
         },
-        "sun": {
-            "type": "directional", "direction": [-float(v) for v in sun_direction],
-            "irradiance": {"type": "uniform", "value": irradiance},
-        },
+        "sun": light,
     }
+
+
+@cache
+def _class_of(name: str, base: str, variant: str) -> type:
+    from . import sun
+
+    return bound(getattr(sun, name), base)
+
+
+def class_of(name: str, base: str) -> type:
+    """A class of :mod:`.sun` in the current variant."""
+    return _class_of(name, base, mi.variant())

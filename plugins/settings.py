@@ -1,7 +1,7 @@
 """Reading the emitter's Mitsuba properties: names, defaults and checks, nothing that depends on a variant.
 
-All errors are :class:`~atmo_jit.errors.InputError`: one line that names the parameter, what was found and what is allowed.
-Properties that nobody asked for stay unqueried, and Mitsuba reports them as it does for every plugin.
+All errors are :class:`~atmo_jit.errors.InputError`: one line that names the parameter, what was found and what is
+allowed. Properties that nobody asked for stay unqueried, and Mitsuba reports them as it does for every plugin.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from .sun_position import Moment, sun_direction
 DEFAULT_ALTITUDE_M = 1.0
 SMALLEST_SUN_DEG = 0.01  # of the aperture: single precision cannot resolve a smaller disc, and a point has no radiance
 BOTH_SUNS = (
-    "Both the 'sun_direction' and parameters for time/location were provided, both information cannot be given at the same time!"
+    "Both the 'sun_direction' and parameters for time/location were provided, "
+    "both information cannot be given at the same time!"
 )
 AEROSOL = "the aerosol itself, mie.scattering_per_m (1/m), mie.scale_height_m and mie.phase.g, in place of turbidity"
 # Keys that may replace those of a description, so that they are found although the description does not have them.
@@ -41,7 +42,7 @@ LEAVES = (
 
 @dataclass
 class Settings:
-    """What the properties say. ``direction`` is in world space if it was given, in the local frame if ``moment`` is set."""
+    """What the properties say. ``direction`` is in world space as given, or in the local frame if ``moment`` is set."""
 
     atmosphere: Atmosphere
     direction: tuple[float, float, float]
@@ -115,6 +116,15 @@ def unit_vector(name: str, value: Iterable[float]) -> tuple[float, float, float]
     return found[0] / length, found[1] / length, found[2] / length
 
 
+def turning(matrix: np.ndarray) -> None:
+    """Refuse a transformation [4, 4] that changes the angles between directions: densities would be wrong."""
+    m = np.asarray(matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    square = m.T @ m
+    size = np.trace(square) / 3.0
+    if not (np.isfinite(size) and size > 0.0 and np.allclose(square, size * np.eye(3), atol=1e-4 * size)):
+        raise AtmosphereError("to_world", "a transformation that distorts angles", "a rotation, also mirrored or scaled")
+
+
 def values(raw: Any) -> Any:
     """A property's value as Atmosphere takes it: a number, a list of numbers or a word.
 
@@ -137,7 +147,7 @@ def values(raw: Any) -> Any:
 
 
 def _instead_of(turbidity: Any) -> str:
-    """What to give in place of a turbidity: Preetham, Shirley and Smits (1999), appendix A, over the default scale height."""
+    """What to give in place of a turbidity: Preetham, Shirley and Smits (1999), appendix A, for 1200 m of aerosol."""
     if isinstance(turbidity, bool) or not isinstance(turbidity, (int, float)) or not 1.0 <= turbidity <= 10.0:
         return AEROSOL
     depth = max(0.04608365822050 * turbidity - 0.04586025928522, 0.0) * 0.55**-1.3
@@ -196,7 +206,7 @@ def _sun(props: Any) -> tuple[tuple[float, float, float], Moment | None]:
 
 
 def moment_direction(found: dict[str, float]) -> tuple[tuple[float, float, float], Moment]:
-    """The sun's direction in the local frame at a place and time given by name; year, month and day are whole numbers."""
+    """The sun's direction in the local frame at a place and time given by name; the date in whole numbers."""
     whole = {name: int(round(found[name])) for name in ("year", "month", "day")}
     if not 1 <= whole["month"] <= 12:
         raise AtmosphereError("month", shown(whole["month"]), "a whole number in [1, 12]")

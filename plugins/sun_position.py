@@ -1,8 +1,9 @@
 """Where the sun stands: the PSA algorithm, in the frame and with the conventions of Mitsuba's ``sunsky``.
 
-Source: M. Blanco-Muriel, D. C. Alarcon-Padilla, T. Lopez-Moratalla, M. Lara-Coira, "Computing the solar vector", Solar Energy
-70(5), 2001; valid 1999-2015, where it is within 0.5 arc minutes, and drifting by less than 0.01 degrees up to 2050. Double precision:
-``sunsky`` computes the same in single precision, whose Julian day has steps of a quarter of a day, and is off by up to 0.05 degrees.
+Source: M. Blanco-Muriel, D. C. Alarcon-Padilla, T. Lopez-Moratalla, M. Lara-Coira, "Computing the solar vector",
+Solar Energy 70(5), 2001; valid 1999-2015, where it is within 0.5 arc minutes, and drifting by less than 0.01 degrees
+up to 2050. Double precision: ``sunsky`` computes the same in single precision, whose Julian day has steps of a
+quarter of a day, and is off by up to 0.05 degrees.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ ASTRONOMICAL_UNIT_KM = 149597890.0
 
 @dataclass(frozen=True)
 class Moment:
-    """A place and a local time. Degrees (north and east positive), hours from UTC, civil date; sunsky's defaults: Tokyo, 10 July 2010, 15:00."""
+    """A place (degrees north and east) and a local time (hours from UTC, civil date).
+
+    The defaults are those of sunsky: Tokyo, 10 July 2010, 15:00.
+    """
 
     latitude: float = 35.6894
     longitude: float = 139.6917
@@ -61,7 +65,8 @@ def sun_angles(moment: Moment) -> tuple[float, float]:
     hour_angle = math.radians(15.0 * sidereal_hours + moment.longitude) - right_ascension
 
     latitude = math.radians(moment.latitude)
-    cosine = math.cos(latitude) * math.cos(hour_angle) * math.cos(declination) + math.sin(declination) * math.sin(latitude)
+    cosine = math.cos(latitude) * math.cos(hour_angle) * math.cos(declination)
+    cosine += math.sin(declination) * math.sin(latitude)
     zenith = math.acos(min(max(cosine, -1.0), 1.0))
     south_north = math.tan(declination) * math.cos(latitude) - math.sin(latitude) * math.cos(hour_angle)
     azimuth = math.atan2(-math.sin(hour_angle), south_north)
@@ -71,7 +76,8 @@ def sun_angles(moment: Moment) -> tuple[float, float]:
 def sun_direction(moment: Moment) -> tuple[float, float, float]:
     """Unit vector towards the sun in sunsky's local frame: Z up.
 
-    ``sunsky`` documents X as north but computes azimuth - 180 degrees, so that X points south and Y west; scenes rely on what it computes.
+    ``sunsky`` documents X as north but computes azimuth - 180 degrees, so that X points south and Y west; scenes rely
+    on what it computes.
     """
     zenith, azimuth = sun_angles(moment)
     angle = azimuth - math.pi

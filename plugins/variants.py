@@ -8,10 +8,11 @@ import mitsuba as mi
 
 
 def bound(description: type, base: str) -> type:
-    """A subclass of ``mi.<base>`` of the current variant with the attributes of ``description`` and of its own base classes.
+    """A subclass of ``mi.<base>`` of the current variant with the attributes of ``description`` and of its own base
+    classes.
 
-    Mitsuba's classes allow no second base class, so the attributes are copied. ``description`` calls inherited methods as
-    ``mi.<base>.method(self, ...)``.
+    Mitsuba's classes allow no second base class, so the attributes are copied. ``description`` calls inherited
+    methods as ``mi.<base>.method(self, ...)``.
     """
     skipped = ("__dict__", "__weakref__")
     attributes: dict[str, Any] = {}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bench.worlds import WORLDS, views_of, world
 from twins import Twin, cosines
 
 import atmo_jit
+from bench.worlds import WORLDS, views_of, world
 
 TRANSMITTANCE = 1e-4  # absolute; the figure, and what 8-bit pictures could never show
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bench.worlds import WORLDS, views_of, world
 from twins import Twin, cosines
 
 import atmo_jit
+from bench.worlds import WORLDS, views_of, world
 
 MEDIAN, P99 = 0.1, 1.0  # per cent, where radiance > 1e-3 of the peak: the figures
 BRIGHT = 1e-3

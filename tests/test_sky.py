@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bench.worlds import WORLDS, views_of, world
 from twins import Twin
 
 import atmo_jit
+from bench.worlds import WORLDS, views_of, world
 
 SPEC = WORLDS["small planet"]
 

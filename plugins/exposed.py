@@ -1,0 +1,35 @@
+"""Plugin parameters as ``mi.traverse`` exposes them: arrays that it can write to, in every variant."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def array(value: Any) -> Any:
+    """Numbers as a ``mi.Float`` array; in scalar variants, whose Float is a Python number, as a Dr.Jit scalar array."""
+    kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf
+    return kind([float(v) for v in np.atleast_1d(np.asarray(value, dtype=np.float64))])
+
+
+def host(value: Any) -> np.ndarray:
+    """The values of a parameter as a flat float64 array."""
+    return np.array(dr.detach(value), dtype=np.float64).ravel()
+
+
+def first(value: Any) -> float:
+    """The value of a parameter that is one number."""
+    return float(host(value)[0])
+
+
+def single(value: Any) -> Any:
+    """A parameter that is one number in the variant's Float, with its gradient."""
+    return value if dr.is_jit_v(mi.Float) else value[0]
+
+
+def number(x: float) -> Any:
+    """``x`` in the variant's Float, read from memory so that kernels do not depend on its value."""
+    return dr.opaque(mi.Float, float(x)) if dr.is_jit_v(mi.Float) else float(x)
