@@ -107,15 +107,22 @@ def padded(channel_count: int) -> int:
     return 4 if channel_count == 3 else channel_count
 
 
+def scatter_packet(buffer: Any, values: Sequence[Any], index: Any, size: int) -> None:
+    """Write ``values`` to ``size`` consecutive floats from ``index * size``, zeros where there are fewer."""
+    import drjit as dr
+
+    t = types()
+    if size == 1:
+        dr.scatter(buffer, values[0], index)
+    else:
+        dr.scatter(buffer, t.ArrayXf([*values, *[t.Float(0.0)] * (size - len(values))]), index)
+
+
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
     import drjit as dr
 
-    t = types()
-    out = dr.zeros(t.Float, dr.width(lane) * size)
-    if size == 1:
-        dr.scatter(out, values[0], lane)
-    else:
-        dr.scatter(out, t.ArrayXf([*values, *[t.Float(0.0)] * (size - len(values))]), lane)
+    out = dr.zeros(types().Float, dr.width(lane) * size)
+    scatter_packet(out, values, lane, size)
     dr.eval(out)
     return out

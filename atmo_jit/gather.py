@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, stored, types
+from .backend import floats, packet, padded, scatter_packet, stored, types
 from .geometry import safe_sine
 from .grid import Grid
 from .harmonics import legendre, pair_count
@@ -132,9 +132,10 @@ class Gather:
         weights = stored(products, lane, size)
 
         basis = self.samples.basis(degree)
-        lane = dr.arange(t.UInt, visits * suns * orders)
-        m, rest = lane % orders, lane // orders
-        sun, visit = rest % suns, rest // suns
+        # Suns vary fastest: eight neighbouring lanes share path and m, and run equally long loops.
+        lane = dr.arange(t.UInt, visits * orders * suns)
+        sun, rest = lane % suns, lane // suns
+        m, visit = rest % orders, rest // orders
         node = dr.gather(t.UInt, device.level, visit) * suns + sun
         first = m * (2 * degree + 3 - m) // 2 - m  # place of (l, m) is first + l
 
@@ -149,18 +150,20 @@ class Gather:
         _, sums = dr.while_loop((m + 0, zero), lambda l_, _: l_ < end, add, label="contract")
         # The ground scatters into every direction alike: it joins m = 0 at the visit where a path ends on it.
         light = packet(sky, sun, size, m == 0)
-        sums = [
-            dr.fma(dr.gather(t.Float, self._weights.reflected[c], visit, m == 0), light[c], sums[c]) for c in range(channels)
-        ]
-        inner = stored(sums, lane, size)
-        lane = dr.arange(t.UInt, visits * (suns + 2) * orders)
-        m, rest = lane % orders, lane // orders
-        sun, visit = rest % (suns + 2), rest // (suns + 2)
-        near = dr.select(sun == 0, 1, dr.minimum(dr.maximum(sun, 1) - 1, suns - 1))
-        values = packet(inner, (visit * suns + near) * orders + m, size)
-        before = packet(inner, (visit * suns + suns - 2) * orders + m, size, sun == suns + 1)
-        sign = dr.select((sun == 0) & (m % 2 == 1), -1.0, dr.select(sun == suns + 1, 2.0, 1.0))
-        return stored([dr.fma(sign, a, -b) for a, b in zip(values, before, strict=True)], lane, size)
+        reflected = [dr.gather(t.Float, b, visit, m == 0) for b in self._weights.reflected]
+        sums = [dr.fma(a, b, c) for a, b, c in zip(reflected, light, sums, strict=False)]
+        table = dr.zeros(t.Float, visits * (suns + 2) * orders * size)
+        scatter_packet(table, sums, (visit * (suns + 2) + sun + 1) * orders + m, size)
+        dr.eval(table)
+        lane = dr.arange(t.UInt, visits * orders)
+        m, start = lane % orders, lane // orders * (suns + 2)
+        mirrored = packet(table, (start + 2) * orders + m, size)
+        last, before = packet(table, (start + suns) * orders + m, size), packet(table, (start + suns - 1) * orders + m, size)
+        sign = dr.select(m % 2 == 1, -1.0, 1.0)
+        scatter_packet(table, [sign * v for v in mirrored], start * orders + m, size)
+        scatter_packet(table, [2.0 * a - b for a, b in zip(last, before, strict=True)], (start + suns + 1) * orders + m, size)
+        dr.eval(table)
+        return table
 
 
 def _cubic(f: Any) -> list[Any]:

@@ -1,7 +1,7 @@
 """Real spherical harmonics that are even in azimuth, orthonormal over the sphere: P_lm(mu) cos(m phi).
 
-Radiance under one sun is mirror-symmetric about the plane of sun and zenith, so only cosines occur. Pairs (l, m) are stored with m outside
-and l inside: all l >= m for m = 0, then for m = 1, ... The first pair is (0, 0): the mean.
+Radiance under one sun is mirror-symmetric about the plane of sun and zenith, so only cosines occur. Pairs (l, m) are
+stored with m outside and l inside: all l >= m for m = 0, then for m = 1, ... The first pair is (0, 0): the mean.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ def pairs(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=64)
 def recurrence(degree: int) -> np.ndarray:
-    """Coefficients (a, b, s) [pair_count(degree), 3] of P_lm = a (mu P_{l-1,m} - b P_{l-2,m}) and of the start P_mm = s sin P_{m-1,m-1}.
+    """Coefficients (a, b, s) [pair_count(degree), 3] of the recurrences.
 
+    P_lm = a (mu P_{l-1,m} - b P_{l-2,m}), starting from P_mm = s sin(theta) P_{m-1,m-1}.
     P_00 = 1 / sqrt(4 pi). For m >= 1 the norm holds sqrt(2): the integral of (P_lm cos m phi)^2 over the sphere is 1.
     """
     table = np.zeros((pair_count(degree), 3))

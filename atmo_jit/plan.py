@@ -27,7 +27,7 @@ class Resolution:
 
     altitudes: int = 12
     suns: int = 25
-    refine: tuple[int, int] = (2, 4)
+    refine: tuple[int, int] = (1, 4)
     first_suns: int = 2
     up: int = 6
     down: int = 4
@@ -38,8 +38,8 @@ class Resolution:
     first_azimuths: int = 14
     first_degree: int = 12
     phase_degree: int = 16
-    beam_refine: int = 4
-    beam_azimuths: int = 6
+    beam_refine: int = 6
+    beam_azimuths: int = 5
     orders: int = 40
     columns: tuple[int, int] = (128, 96)
 
@@ -54,9 +54,10 @@ class Resolution:
         fine = tolerance < 0.005
         return cls(
             altitudes=_altitudes(atmosphere, 16 if fine else 12),
+            refine=(2 if fine else 1, 4),
             up=later + (4 if later > 6 else 2),
             down=max(4, (4 * later) // 5 + 2),
-            azimuths=max(later, first // 2) + 2,
+            azimuths=max(later, first // 2) + 1,
             degree=later,
             first_up=max(10, first + 2 if first > 12 else first),
             first_down=max(8, first if first > 12 else first - 2),

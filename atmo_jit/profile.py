@@ -102,7 +102,7 @@ class Tabulated:
 
     @property
     def steps_m(self) -> tuple[float, ...]:
-        """The altitudes at which the density jumps (m): those given twice, and the last where the density there is not 0."""
+        """The altitudes at which the density jumps (m): those given twice, and the last unless density is 0 there."""
         twice = self.altitude_m[1:][np.diff(self.altitude_m) == 0.0].tolist()
         return (*twice, *([float(self.altitude_m[-1])] if self.values[-1] > 0.0 else []))
 

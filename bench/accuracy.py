@@ -209,9 +209,10 @@ def worst_rays(value: np.ndarray, data: Mapping[str, np.ndarray], count: int = 1
 def peers(path: Path | None = None) -> dict[str, list[Row]]:
     """The same rows for what the reference files hold of others: Bruneton's 2017 tables and SASKTRAN2."""
     grid, rays = reference.load("single_scattering_earth", path), reference.load("sky_radiance", path)
-    single = dict(rays, L=np.where(rays["L_single"] > 0, rays["L_single"], np.nan))
+    one_event = rays["L_single"] + rays["L_ground_direct"]
+    single = dict(rays, L=np.where(one_event > 0, one_event, np.nan))
     result = {"bruneton2017, order 1": single_scattering_rows(grid["peer_bruneton2017_table_order1"], grid)}
-    result["sasktran2, order 1"] = all_orders_rows(np.where(rays["L_single"] > 0, rays["sas_single"], np.nan), single)
+    result["sasktran2, order 1"] = all_orders_rows(np.where(one_event > 0, rays["sas_single"], np.nan), single)
     for name in ("sas_do16", "sas_do16_nsza9", "sas_so302"):
         result[name.replace("sas_", "sasktran2, ")] = all_orders_rows(rays[name], rays)
     return result

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.sky import Sky
 
 from . import albedo, bounds, settings
-from .exposed import array, first, host, single
+from .exposed import array, first, host, single, variables
 from .light import Light
 from .sun_position import Moment
 
@@ -21,6 +23,12 @@ from .sun_position import Moment
 FAR = 1e10
 TABLES = {"sky_radiance", "sun_radiance"}
 SCALES = {"sun_scale", "sky_scale", "sampling_weight"}
+
+
+@lru_cache(maxsize=2)
+def _solved(atmosphere: Atmosphere) -> Sky:
+    """The solved sky; emitters that differ only in sun, place or variant share it."""
+    return Sky(atmosphere)
 
 
 class AtmosphereEmitter:
@@ -236,7 +244,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         if dr.is_jit_v(mi.Float):
             dr.make_opaque(sun, self._sun_direction)
         if self._sky is None:
-            self._sky = Sky(self._atmosphere)
+            self._sky = _solved(self._atmosphere)
         light = Light(self._sky, first(self._values["altitude"]), sun, self._limb_darkening)
         if self._light is not None:
             # The tensors that mi.traverse has handed out stay those that are in use.
@@ -249,6 +257,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
 
     def _prepare(self) -> None:
         self._light.prepare(first(self._values["sun_scale"]), first(self._values["sky_scale"]))
+        self._variables = variables(self._light)
 
     # ---- light, in world space
 

@@ -33,3 +33,22 @@ def single(value: Any) -> Any:
 def number(x: float) -> Any:
     """``x`` in the variant's Float, read from memory so that kernels do not depend on its value."""
     return dr.opaque(mi.Float, float(x)) if dr.is_jit_v(mi.Float) else float(x)
+
+
+def variables(*objects: Any) -> list[Any]:
+    """All Dr.Jit arrays and textures inside ``objects``, however deep.
+
+    A plugin that keeps this list among its own attributes can be used in ``dr.freeze``, which does not look into
+    objects of plain Python classes.
+    """
+    found: list[Any] = []
+    for value in objects:
+        if dr.is_array_v(value) or hasattr(value, "IsTexture"):
+            found.append(value)
+        elif isinstance(value, (list, tuple)):
+            found += variables(*value)
+        elif isinstance(value, dict):
+            found += variables(*value.values())
+        elif type(value).__module__.startswith("atmo_jit.plugins"):
+            found += variables(*vars(value).values())
+    return found

@@ -25,6 +25,8 @@ from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, SUN_COLUMNS, SUN_ROWS, Panora
 
 SKY_SHAPE = (ROWS_DOWN + ROWS_UP + 2, COLUMNS + 1)
 SUN_SHAPE = (SUN_ROWS, SUN_COLUMNS)
+# Step of the difference that stands for the table's derivative: the radiance of twilight changes by 1 % over it.
+SUN_STEP_RAD = 2e-3
 
 
 @dataclass
@@ -54,14 +56,29 @@ class Light:
         self.heading = self._heading(math.hypot(x, y))
         air = sky.atmosphere
         self.view = Panorama.of(air.bottom_radius_m, air.thickness_m, altitude_m, math.atan2(math.hypot(x, y), z))
-        zenith = dr.atan2(dr.norm(mi.Vector2f(sun.x, sun.y)), sun.z) if dr.grad_enabled(sun) else None
-        self.sky_table = self.channels.tensor(solve_sky(sky, self.view, sun_zenith=zenith), SKY_SHAPE)
+        self.sky_table = self.channels.tensor(solve_sky(sky, self.view), SKY_SHAPE)
+        if dr.grad_enabled(sun):
+            self.sky_table = self._follow_sun(sky)
 
         aperture = max(2.0 * air.sun_angular_radius_deg, settings.SMALLEST_SUN_DEG)
         self.disc = solve_disc(sky, self.view, math.radians(0.5 * aperture), limb_darkening)
         radiance = self.disc.brightness * air.solar_irradiance / self.disc.solid_angle
         values = list(np.moveaxis(radiance, -1, 0).reshape(radiance.shape[-1], -1))
         self.sun_table = self.channels.tensor(values, SUN_SHAPE)
+
+    def _follow_sun(self, sky: Sky) -> Any:
+        """The sky's table with its derivative by the sun's zenith angle, a central difference of the solver's results.
+
+        The derivative by its azimuth is in the look-up.
+        """
+        zenith, step = self.view.sun_zenith, SUN_STEP_RAD
+        low, high = (
+            self.channels.tensor(solve_sky(sky, self.view, zenith + d), SKY_SHAPE).array for d in (-step, step)
+        )
+        angle = dr.atan2(dr.norm(mi.Vector2f(self.sun.x, self.sun.y)), self.sun.z)
+        move = dr.replace_grad(mi.Float(0.0), angle)
+        values = dr.detach(self.sky_table.array) + move * (dr.detach(high - low) / (2.0 * step))
+        return mi.TensorXf(values, self.sky_table.shape)
 
     def _heading(self, across: float) -> tuple[Any, Any]:
         """Horizontal unit vector towards the sun; any one where it stands at the zenith."""

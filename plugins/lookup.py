@@ -73,7 +73,9 @@ class SkyLookup:
         probability = weight / total if total > 0.0 else np.zeros_like(weight)
         even = EVEN_SHARE if total > 0.0 else 1.0
         probability = (1.0 - even) * probability + even * solid / solid.sum()
-        self.distribution = mi.DiscreteDistribution2D(np.ascontiguousarray(probability, dtype=np.float32))
+        rows = probability.sum(axis=1)
+        self.row_steps = Steps(rows)
+        self.column_steps = Steps(probability / rows[:, None])
         self.density = texture((probability / solid)[..., None], nearest=True)
 
     def elevation(self, z: Any, across: Any) -> Any:
@@ -108,14 +110,43 @@ class SkyLookup:
 
     def sample(self, sample: Any, active: Any) -> tuple[Any, Any]:
         """Sine of the elevation above the horizontal, and azimuth from the sun in [-pi, pi]: even within a cell."""
-        cell, _, rest = self.distribution.sample(sample, active)
-        left = rest.x < 0.5
-        along = dr.select(left, 2.0 * rest.x, dr.fma(2.0, rest.x, -1.0))
-        column = (mi.Float(cell.x) + along + 0.5) / (COLUMNS + 1)
+        row, up = self.row_steps.find(sample.y, 0.5, active)
+        column, along = self.column_steps.find(sample.x, (row + 0.5) / ROWS, active)
+        left = along < 0.5
+        along = dr.select(left, dr.fma(-2.0, along, 1.0), dr.fma(2.0, along, -1.0))
         # The rows at the horizon stand twice among the nodes: cells above it begin one node later.
-        row = mi.Float(cell.y) + rest.y + dr.select(cell.y >= ROWS_DOWN, 1.5, 0.5)
-        phi = self.azimuths.eval(column, active)[0]
-        return self.sines.eval(row / (ROWS + 2), active)[0], dr.select(left, phi, -phi)
+        at = row + up + dr.select(row >= ROWS_DOWN, 1.5, 0.5)
+        phi = self.azimuths.eval((column + along + 0.5) / (COLUMNS + 1), active)[0]
+        return self.sines.eval(at / (ROWS + 2), active)[0], dr.select(left, -phi, phi)
+
+
+class Steps:
+    """Inversion of cumulative probabilities: one distribution, or one per row of an array [rows, count].
+
+    Mitsuba's own two-dimensional distribution is closed to ``dr.freeze`` in Python.
+    """
+
+    def __init__(self, probability: np.ndarray) -> None:
+        self.count = probability.shape[-1]
+        sums = np.cumsum(np.atleast_2d(probability), axis=1)
+        sums = np.concatenate([np.zeros((len(sums), 1)), sums / sums[:, -1:]], axis=1)
+        # Bounds of each step side by side, so that the step found is read in one go.
+        self.bounds = texture(np.stack([sums[:, :-1], sums[:, 1:]], axis=-1), nearest=True)
+
+    def find(self, sample: Any, row: Any, active: Any) -> tuple[Any, Any]:
+        """The step that ``sample`` in [0, 1) falls into, as a Float, and the fraction of it that lies below.
+
+        ``row``: texture coordinate of the distribution.
+        """
+        found = mi.Float(0.0) + 0.0 * sample
+        width = 1 << (self.count - 1).bit_length()
+        while width > 1:
+            width //= 2
+            next_one = found + width
+            low = self.bounds.eval(mi.Point2f((next_one + 0.5) / self.count, row), active)[0]
+            found = dr.select((next_one < self.count) & (low <= sample), next_one, found)
+        low, high = self.bounds.eval(mi.Point2f((found + 0.5) / self.count, row), active)
+        return found, dr.clip((sample - low) / dr.maximum(high - low, 1e-30), 0.0, 1.0)
 
 
 def importance(view: Panorama, luminance: np.ndarray) -> tuple[np.ndarray, float]:

@@ -43,7 +43,7 @@ The air of a planet (:monosp:`atmosphere_medium`)
         channels = props.get("channels", None)
         if channels is not None:
             channels = [int(v) for v in np.atleast_1d(settings.values(channels))]
-        wavelengths = Wavelengths(atmosphere.wavelengths_nm, props.get("wavelength_mode", "channels"), channels)
+        wavelengths = Wavelengths(atmosphere.wavelengths_nm, props.get("wavelength_rule", "channels"), channels)
         self.air = Air(atmosphere, center, scale, wavelengths)
         phase.use(self.air)
         self.m_is_homogeneous = False

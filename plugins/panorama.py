@@ -150,15 +150,14 @@ def mean_of_corners(values: np.ndarray) -> np.ndarray:
     return 0.5 * (rows[:, 1:] + rows[:, :-1])
 
 
-def solve_sky(sky: Any, view: Panorama, altitude_m: Any = None, sun_zenith: Any = None) -> list[Any]:
+def solve_sky(sky: Any, view: Panorama, sun_zenith: Any = None) -> list[Any]:
     """Radiance at all nodes, ground included: a list of W Dr.Jit Floats of length rows x columns.
 
-    ``altitude_m`` and ``sun_zenith``: Dr.Jit numbers to use in place of the panorama's own, to carry derivatives.
+    ``sun_zenith`` (rad): another sun for the same directions, also a Dr.Jit number that carries a derivative.
     """
     zenith, azimuth = view.directions()
-    altitude = view.altitude_m if altitude_m is None else altitude_m
     sun = view.sun_zenith if sun_zenith is None else sun_zenith
-    radiance = list(sky.rays(*_together(altitude, sun, zenith, azimuth)).radiance)
+    radiance = list(sky.rays(*_together(view.altitude_m, sun, zenith, azimuth)).radiance)
     dr.eval(radiance)  # all wavelengths in one kernel
     return radiance
 

@@ -35,15 +35,17 @@ import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, shown
-from atmo_jit.spectrum import SpectralBasis
+from atmo_jit.spectrum import SpectralBasis, interpolation_weights
 
 from . import plugin_class
 from .variants import bound
+from .wavelengths import Wavelengths
 
 SUNS = ("unit", "solar", "colour")
 MESH_RADIUS_M = 1500e3
 SECTORS = 96
 STEP = 1.08  # ratio of the radii of neighbouring rings of vertices
+GOLDEN = 0.6180339887  # the irrational number that is hardest to approximate
 SPHERE_DEPTH = 1e-4  # of the sphere that is the rest of the ground, in planet radii
 
 
@@ -54,13 +56,15 @@ def ground_mesh(radius_m: float, altitude_m: float, scale: float, up: np.ndarray
     angle = rings / radius_m
     # Facets sink further below the sphere than their vertices; that does no harm.
     depth = 1.01 * mi.math.RayEpsilon * (1.0 / scale + np.maximum(rings, altitude_m + rings * angle))
-    turn = 2.0 * math.pi * np.arange(SECTORS) / SECTORS
+    # Embree lets rays through that meet an edge exactly: no edge or vertex lies in a plane or on a line that views are
+    # likely to be in, and no two rings have edges in line.
+    turn = 2.0 * math.pi * (np.arange(SECTORS) + GOLDEN * np.arange(len(rings))[:, None]) / SECTORS
+    axes = frame(up)
+    axes = frame(up + (0.43 * axes[0] + 0.61 * axes[1]) / radius_m)
     sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
-    normals = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.broadcast_to(cosine, (len(rings), SECTORS))], -1)
-    vertices = (radius_m - depth)[:, None, None] * normals
-    # z = (R - depth) cos(angle) - R - altitude without the cancellation.
-    vertices[..., 2] = (-altitude_m - 2.0 * radius_m * np.sin(0.5 * angle) ** 2 - depth * np.cos(angle))[:, None]
-    vertices, normals = vertices @ frame(up), normals @ frame(up)
+    normals = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.broadcast_to(cosine, turn.shape)], -1) @ axes
+    # In double precision the sum is exact to a nanometre.
+    vertices = normals * (radius_m - depth)[:, None, None] - (radius_m + altitude_m) * up
     i, j = np.meshgrid(np.arange(len(rings) - 1), np.arange(SECTORS), indexing="ij")
     k = (j + 1) % SECTORS
     a, b, c, d = (row * SECTORS + column for row, column in ((i, j), (i + 1, j), (i + 1, k), (i, k)))
@@ -68,7 +72,7 @@ def ground_mesh(radius_m: float, altitude_m: float, scale: float, up: np.ndarray
     faces = np.concatenate([outer.reshape(-1, 3), inner.reshape(-1, 3)])
     props = mi.Properties()
     props["bsdf"] = bsdf
-    mesh = mi.Mesh("ground", len(vertices) * SECTORS, len(faces), props=props, has_vertex_normals=True)
+    mesh = mi.Mesh("ground", turn.size, len(faces), props=props, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = (scale * vertices).ravel().astype(np.float32)
     parameters["vertex_normals"] = normals.ravel().astype(np.float32)
@@ -78,11 +82,34 @@ def ground_mesh(radius_m: float, altitude_m: float, scale: float, up: np.ndarray
 
 
 def frame(up: np.ndarray) -> np.ndarray:
-    """Rows x, y, z of a right-handed frame with z along the unit vector ``up``."""
+    """Rows x, y, z of a right-handed frame with z along ``up``."""
+    up = up / np.linalg.norm(up)
     across = np.eye(3)[int(np.argmin(np.abs(up)))]
     x = np.cross(np.cross(up, across), up)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(up, x), up])
+
+
+def light_of(
+    atmosphere: Atmosphere, sun: str, channels: Sequence[int] | None
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """The wavelengths in use, sunlight [C, U] that gives each of them its part of the picture, and the nm of C in spectral variants."""
+    irradiance = np.ones_like(atmosphere.solar_irradiance) if sun == "unit" else atmosphere.solar_irradiance
+    basis = SpectralBasis.of(atmosphere)
+    if mi.is_spectral:
+        matrix = basis.matrix(basis.grid_nm)
+        if sun == "unit":
+            matrix = interpolation_weights(atmosphere.wavelengths_nm, basis.grid_nm)
+        used = list(range(len(irradiance)))
+    elif sun == "colour":
+        matrix = basis.srgb_matrix if mi.is_rgb else basis.xyz_matrix[1:2]
+        used = list(range(len(irradiance)))
+    else:
+        of_channel = Wavelengths(atmosphere.wavelengths_nm, "channels", channels and list(channels)).channels
+        used = sorted(set(of_channel))
+        matrix = np.zeros((len(of_channel), len(irradiance)))
+        matrix[np.arange(len(of_channel)), of_channel] = 1.0
+    return used, (matrix * irradiance)[:, used] * len(used), basis.grid_nm
 
 
 def planet(
@@ -120,9 +147,9 @@ def planet(
     props = mi.Properties("atmosphere_medium")
     props["atmosphere"] = json.dumps(atmosphere.to_dict())
     props["center"], props["scale"] = mi.ScalarPoint3f(center), scale
-    props["wavelength_mode"] = "time" if sun == "colour" else "channels"
-    if channels is not None:
-        props["channels"] = ", ".join(map(str, channels))
+    props["wavelength_rule"] = "time"
+    selected, colours, nm = light_of(atmosphere, sun, channels)
+    props["channels"] = ", ".join(map(str, selected))
     air = plugin_class("atmosphere_medium")(props)
     wavelengths = air.air.wavelengths
 
@@ -130,10 +157,7 @@ def planet(
     reflectance.use(atmosphere.ground_albedo, wavelengths)
     bsdf = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
     light = class_of("Sun", "Emitter")(mi.Properties())
-    ones = np.ones_like(atmosphere.solar_irradiance)
-    irradiance = ones if sun == "unit" else atmosphere.solar_irradiance
-    basis = SpectralBasis.of(atmosphere) if sun != "unit" else SpectralBasis(atmosphere.wavelengths_nm, ones)
-    light.shine(to_sun, sun_radius_deg, irradiance, wavelengths, basis if sun == "colour" or mi.is_spectral else None)
+    light.shine(to_sun, sun_radius_deg, colours, wavelengths, nm)
     return {
         "air": air,
         "ground": ground_mesh(radius, altitude_m, scale, up_, bsdf),

@@ -122,7 +122,7 @@ def turning(matrix: np.ndarray) -> None:
     square = m.T @ m
     size = np.trace(square) / 3.0
     if not (np.isfinite(size) and size > 0.0 and np.allclose(square, size * np.eye(3), atol=1e-4 * size)):
-        raise AtmosphereError("to_world", "a transformation that distorts angles", "a rotation, also mirrored or scaled")
+        raise AtmosphereError("to_world", "a transformation that distorts angles", "rotations, also mirrored or scaled")
 
 
 def values(raw: Any) -> Any:
@@ -199,7 +199,9 @@ def _sun(props: Any) -> tuple[tuple[float, float, float], Moment | None]:
         if given:
             raise InputError(BOTH_SUNS)
         raw = values(props["sun_direction"])
-        return unit_vector("sun_direction", raw if isinstance(raw, list) else [math.nan]), None
+        if not isinstance(raw, list) or not all(isinstance(v, float) for v in raw):
+            raise AtmosphereError("sun_direction", shown(raw), "a vector of three finite numbers, not all 0")
+        return unit_vector("sun_direction", raw), None
     defaults = Moment()
     found = {name: number(props, name, getattr(defaults, name)) for name in Moment.names()}
     return moment_direction(found)

@@ -9,8 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.spectrum import SpectralBasis
-
 from .exposed import array, host, number
 from .lookup import texture
 from .wavelengths import Wavelengths
@@ -72,50 +70,41 @@ class Sun:
         self.m_needs_sample_3 = False
 
     def shine(
-        self, direction: np.ndarray, radius_deg: float, irradiance: np.ndarray, wavelengths: Wavelengths, basis: SpectralBasis | None
+        self, direction: np.ndarray, radius_deg: float, colours: np.ndarray, wavelengths: Wavelengths, nm: np.ndarray
     ) -> None:
-        """Direction towards the sun (unit vector); irradiance [W] across it.
+        """Set direction (towards the sun, unit vector), angular radius (degrees) and light.
 
-        Without a ``basis`` every channel has the irradiance of its wavelength (rule "channels" of :mod:`.wavelengths`). With it, light has
-        the colour that the package gives radiance at those wavelengths.
+        colours: irradiance across the direction, [C, U]: for each of the wavelengths in use, the C channels of the variant; in spectral
+            variants the values at the C wavelengths ``nm``, which are equidistant.
         """
-        self.m_flags = mi.EmitterFlags.Infinite | (
-            mi.EmitterFlags.SpatiallyVarying if radius_deg > 0.0 else mi.EmitterFlags.DeltaDirection
-        )
-        self._direction = mi.Vector3f(*(float(v) for v in direction))
         self._parallel = radius_deg == 0.0
+        shape = mi.EmitterFlags.DeltaDirection if self._parallel else mi.EmitterFlags.SpatiallyVarying
+        self.m_flags = mi.EmitterFlags.Infinite | shape
+        self._direction = mi.Vector3f(*(float(v) for v in direction))
+        if dr.is_jit_v(mi.Float):
+            dr.make_opaque(self._direction)
         sine = math.sin(math.radians(radius_deg))
         self._sine, self._cone = number(sine), number(max(math.pi * sine * sine, 1e-30))
         self._reach = number((2.0 * math.sin(0.5 * math.radians(radius_deg))) ** 2)
-        self._wavelengths, self._spectrum, self._colours = wavelengths, None, None
+        self._wavelengths, self._spectrum = wavelengths, None
         if mi.is_spectral:
-            nm = basis.grid_nm
             self._first, self._step, self._count = float(nm[0]), float(nm[1] - nm[0]), len(nm)
-            # Relative to the irradiance that the basis has at the atmosphere's wavelengths.
-            own = basis.solar_irradiance
-            share = float(np.sum(irradiance) / np.sum(own)) if np.sum(own) > 0.0 else 0.0
-            self._spectrum = texture((basis.sun(nm) * share)[:, None])
-        elif basis is None:
-            self._fixed = wavelengths.fixed(array(irradiance))
+            self._spectra = [texture(column[:, None]) for column in colours.T]
         else:
-            matrix = basis.srgb_matrix if mi.is_rgb else basis.xyz_matrix[1:2]
-            colours = matrix * irradiance * wavelengths.count
-            self._colours = [array(row) for row in colours]
-        if dr.is_jit_v(mi.Float):
-            dr.make_opaque(self._direction)
+            self._channels = [array(row) for row in colours]
 
     def _irradiance(self, it: Any) -> Any:
         """Irradiance across the sun's direction for the path that an interaction belongs to."""
-        if self._spectrum is not None:
-            result = mi.UnpolarizedSpectrum(0.0)
-            for i in range(len(result)):
-                at = (it.wavelengths[i] - self._first + 0.5 * self._step) / (self._step * self._count)
-                result[i] = self._spectrum.eval(at)[0]
-            return result
-        if self._colours is None:
-            return self._fixed
-        (chosen,) = self._wavelengths.choose(it)
-        return mi.UnpolarizedSpectrum(*(self._wavelengths.read(row, None, [chosen])[0] for row in self._colours))
+        row = self._wavelengths.row(it)
+        if not mi.is_spectral:
+            jit = dr.is_jit_v(mi.Float)
+            return mi.UnpolarizedSpectrum(*(dr.gather(mi.Float, c, row) if jit else c[int(row)] for c in self._channels))
+        result = mi.UnpolarizedSpectrum(0.0)
+        for i in range(len(result)):
+            at = (it.wavelengths[i] - self._first + 0.5 * self._step) / (self._step * self._count)
+            for u, spectrum in enumerate(self._spectra):
+                result[i] = dr.select(row == u, spectrum.eval(at)[0], result[i])
+        return result
 
     def eval(self, si: Any, active: Any = True) -> Any:
         return self._seen(-si.wi, si)

@@ -10,7 +10,7 @@ as on the command line; files that a scene names are looked for beside the scene
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,12 @@ def load_scene(
     *,
     width: int | None = None,
     height: int | None = None,
+    edit: Callable[[Any], None] | None = None,
 ) -> Any:
     """The ``mi.Scene`` in a file, for the variant that is set.
 
     width, height: size of the film in pixels in place of the scene's; one alone keeps the scene's proportions.
+    edit: called with the parser's state of the whole scene before anything is made of it, to change it.
     Raises InputError with one line that names the file and what is wrong with it.
     """
     import mitsuba as mi
@@ -45,6 +47,8 @@ def load_scene(
             state = _parse_xml(path, config, parameters or {})
         if width or height:
             _resize_films(path, state, width, height)
+        if edit:
+            edit(state)
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import json
 
 import numpy as np
 import pytest
+from descriptions import changed
 from tolerances import FLOAT64
 
 from atmo_jit.atmosphere import Atmosphere
@@ -14,20 +14,6 @@ from atmo_jit.errors import AtmosphereError, InputError
 from atmo_jit.profile import Exponential, Tabulated, Tent
 
 NAN, INF = float("nan"), float("inf")
-
-
-def changed(description, dotted, value=...):
-    """A deep copy with the value under a dotted name replaced, or removed for ``...``."""
-    result = copy.deepcopy(description)
-    node = result
-    *parents, key = dotted.split(".")
-    for step in parents:
-        node = node[int(step) if isinstance(node, list) else step]
-    if value is ...:
-        del node[key]
-    else:
-        node[int(key) if isinstance(node, list) else key] = value
-    return result
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from descriptions import changed
 
 from atmo_jit import scenes
 from atmo_jit.errors import InputError
@@ -75,19 +76,6 @@ def written(tmp_path, content, name="scene.json"):
     return path
 
 
-def changed(place, value):
-    """DICT with one entry replaced (``...``: removed); ``place`` is a tuple of keys."""
-    content = json.loads(json.dumps(DICT))
-    inner = content
-    for key in place[:-1]:
-        inner = inner[key]
-    if value is ...:
-        del inner[place[-1]]
-    else:
-        inner[place[-1]] = value
-    return content
-
-
 def rendered(scene):
     return np.array(scene.integrator().render(scene, scene.sensors()[0], seed=1, spp=4))
 
@@ -114,14 +102,14 @@ def test_parameters_and_size(tmp_path, name, content):
 def test_matrix_is_row_major(tmp_path):
     matrix = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
     for transform in (matrix, {"matrix": matrix}, [{"matrix": matrix}]):
-        scene = load(written(tmp_path, changed(("ball", "to_world"), transform)))
+        scene = load(written(tmp_path, changed(DICT, ("ball", "to_world"), transform)))
         assert np.allclose(scene.shapes()[0].bbox().center(), [5, 6, 7])
 
 
 def test_files_are_looked_for_beside_the_scene(tmp_path, monkeypatch):
     mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "box.ply"))
     monkeypatch.chdir("/")
-    assert load(written(tmp_path, changed(("ball",), {"type": "ply", "filename": "box.ply"}))).shapes()
+    assert load(written(tmp_path, changed(DICT, ("ball",), {"type": "ply", "filename": "box.ply"}))).shapes()
     assert load(
         written(
             tmp_path,
@@ -174,7 +162,7 @@ MISTAKES = {
 @pytest.mark.parametrize(("place", "value", "message"), MISTAKES.values(), ids=MISTAKES.keys())
 def test_mistakes_in_json(tmp_path, place, value, message):
     with pytest.raises(InputError) as error:
-        load(written(tmp_path, changed(place, value)))
+        load(written(tmp_path, changed(DICT, place, value)))
     assert message in str(error.value)
     assert str(error.value).startswith(f"{tmp_path / 'scene.json'}: ")
     assert "\n" not in str(error.value)
@@ -201,7 +189,7 @@ def test_broken_json(tmp_path, text, message):
 
 
 def test_parameter_text_is_read_as_its_default(tmp_path):
-    path = written(tmp_path, changed(("parameters",), {"n": 1, "x": 1.5, "yes": True, "v": [1, 2, 3], "s": "a"}))
+    path = written(tmp_path, changed(DICT, ("parameters",), {"n": 1, "x": 1.5, "yes": True, "v": [1, 2, 3], "s": "a"}))
     for name, text, allowed in (("n", "x", "a number"), ("x", "1 2", "a number"), ("yes", "1", "true or false")):
         with pytest.raises(InputError, match=f"parameter {name} is '{text}'; must be {allowed}"):
             load(path, {name: text})

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from descriptions import changed
 
 import atmo_jit
 from atmo_jit import presets
@@ -118,19 +118,6 @@ def test_distance_stops_the_ray(run, tmp_path):
     assert ((arrays["transmittance"][1] > 0.8) & (arrays["transmittance"][1] < 1)).all()
 
 
-def wrong(place, value):
-    """The earth's description with one entry replaced; ``...`` removes it."""
-    content = copy.deepcopy(EARTH)
-    inner = content
-    for key in place[:-1]:
-        inner = inner[key]
-    if value is ...:
-        del inner[place[-1]]
-    else:
-        inner[place[-1]] = value
-    return content
-
-
 # place in the file, wrong value, the field as the message must name it
 FIELDS = [
     *(
@@ -165,7 +152,7 @@ FIELDS = [
 @pytest.mark.parametrize(("place", "value", "field"), FIELDS, ids=[f"{'.'.join(p)}={v}"[:50] for p, v, _ in FIELDS])
 def test_every_field_of_the_atmosphere(refused, views, tmp_path, place, value, field):
     file = tmp_path / "wrong.json"
-    file.write_text(json.dumps(wrong(place, value)))
+    file.write_text(json.dumps(changed(EARTH, place, value)))
     message = refused(atmosphere=file, views=views)
     assert field in message and "wrong.json" in message
 
@@ -173,7 +160,7 @@ def test_every_field_of_the_atmosphere(refused, views, tmp_path, place, value, f
 def test_not_numbers_in_the_atmosphere(refused, views, tmp_path):
     for field in ("bottom_radius_m", "ground_albedo", "solar_irradiance"):
         for value in (float("nan"), float("inf")):
-            (tmp_path / "wrong.json").write_text(json.dumps(wrong((field,), value)))
+            (tmp_path / "wrong.json").write_text(json.dumps(changed(EARTH, field, value)))
             assert "wrong.json" in refused(atmosphere=tmp_path / "wrong.json", views=views)
 
 

@@ -1,0 +1,103 @@
+"""Any scene with the emitter ``atmosphere``, with the path-traced air in its place.
+
+``edit`` changes what the parser read: the emitter becomes its own sun (plugin ``atmosphere_sun``), the integrator becomes
+``volpath`` without limit of depth, cameras see as far as there is air. ``planet_of`` gives what has to be added to the scene: air and
+ground, placed so that the scene's origin is at the emitter's ``altitude``. Everything else in the scene stays.
+
+What the picture then shows is what the emitter shows, except that air is also between the camera and the things in the scene, that
+light goes back and forth between those and the planet's own ground, and that the medium scatters the light of a sun with a disc.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from atmo_jit.errors import AtmosphereError, InputError
+
+from . import albedo, settings
+from .planet import light_of, planet
+from .sun import Sun
+from .wavelengths import Wavelengths
+
+REPLACED = ("path", "direct", "volpath", "volpathmis", "atmosphere_path")
+# Farther than any air that a ray passes (the default of 10 km would end the sky there).
+FAR_CLIP = 1e8
+# Paths of this depth are ended by chance: a bounce in the air loses little, so earlier would only add noise.
+ROULETTE_DEPTH = 32
+
+
+class AtmosphereSun(Sun):
+    """The sun of the emitter ``atmosphere``, from the same parameters: what is left of it where the air is path-traced."""
+
+    def __init__(self, props: Any) -> None:
+        Sun.__init__(self, props)
+        given = props.get_texture("albedo") if "albedo" in props else None
+        read = None if given is None else lambda nm: albedo.values(given, nm)
+        found = settings.read(props, lambda name: str(mi.file_resolver().resolve(name)), read)
+        if found.sun_scale != found.sky_scale:
+            text = f"found {found.sun_scale:g}, and sky_scale {found.sky_scale:g}"
+            raise InputError(f"sun_scale: {text}; must be equal where the air is path-traced: one sun lights both")
+        if found.limb_darkening:
+            raise AtmosphereError("complex_sun", "true", "false where the air is path-traced")
+        turn = np.array(props["to_world"].matrix, dtype=np.float64)[:3, :3] if "to_world" in props else np.eye(3)
+        direction = np.array(found.direction, dtype=np.float64)
+        self.sun_direction = direction if found.moment is None else turn @ direction
+        self.up = turn[:, 2] / np.linalg.norm(turn[:, 2])
+        self.found = found
+        used, colours, nm = light_of(found.atmosphere, "colour", None)
+        wavelengths = Wavelengths(found.atmosphere.wavelengths_nm, "time", used)
+        unit = self.sun_direction / np.linalg.norm(self.sun_direction)
+        radius = max(found.atmosphere.sun_angular_radius_deg, 0.5 * settings.SMALLEST_SUN_DEG)
+        self.shine(unit, radius, found.sun_scale * colours, wavelengths, nm)
+
+
+def edit(state: Any) -> None:
+    """Change the parsed scene; raises InputError where it has no, or more than one, emitter ``atmosphere``."""
+    lights = [node.props for node in state.nodes if _is(node, mi.ObjectType.Emitter, ("atmosphere",))]
+    if len(lights) != 1:
+        raise InputError(f"--reference: the scene has {len(lights)} emitters of type atmosphere; must be one")
+    lights[0].set_plugin_name("atmosphere_sun")
+    for node in state.nodes:
+        props = node.props
+        if node.type == mi.ObjectType.Integrator:
+            if props.plugin_name() not in REPLACED:
+                allowed = f"one of {', '.join(REPLACED)}, which volpath replaces"
+                raise InputError(f"--reference: the scene's integrator is {props.plugin_name()}; must be {allowed}")
+            for name in list(props.keys()):
+                if name != "hide_emitters":
+                    props.remove_property(name)
+            props.set_plugin_name("volpath")
+            props["max_depth"], props["rr_depth"] = -1, ROULETTE_DEPTH
+        elif node.type == mi.ObjectType.Sensor:
+            props["shutter_open"], props["shutter_close"] = 0.0, 1.0
+            if props.plugin_name() in ("perspective", "thinlens", "orthographic"):
+                props["far_clip"] = max(FAR_CLIP, float(props.get("far_clip", 0.0)))
+
+
+def _is(node: Any, kind: Any, names: tuple[str, ...]) -> bool:
+    return node.type == kind and node.props.plugin_name() in names
+
+
+def planet_of(scene: Any) -> dict[str, Any]:
+    """Air and ground (objects by name) for a scene that was loaded after :func:`edit`."""
+    (light,) = (e for e in scene.emitters() if hasattr(e, "found"))
+    found = light.found
+    parts = planet(
+        found.atmosphere,
+        sun_direction=light.sun_direction,
+        altitude_m=found.altitude_m,
+        up=light.up,
+        sun="colour",
+    )
+    del parts["sun"]
+    parts["planet"] = mi.load_dict(parts["planet"])
+    return parts
+
+
+def add(state: Any, parts: dict[str, Any]) -> None:
+    """Add objects to a parsed scene (one that :func:`edit` has changed too)."""
+    for name, value in parts.items():
+        state.root.props[f"reference_{name}"] = value
