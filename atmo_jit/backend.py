@@ -1,7 +1,7 @@
 """The Dr.Jit types that every kernel of this package uses, chosen in one place.
 
-The solver has array types of its own, whatever Mitsuba variant is active: ``drjit.llvm.ad`` by default, ``drjit.cuda.ad`` after
-``use("cuda")``. Kernels ask for ``types()`` when they are traced, never at import.
+The solver has array types of its own, whatever Mitsuba variant is active: ``drjit.llvm.ad`` by default,
+``drjit.cuda.ad`` after ``use("cuda")``. Kernels ask for ``types()`` when they are traced, never at import.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def uints(values: Any) -> Any:
 def _aligned(values: Any, dtype: Any) -> np.ndarray:
     """A flat copy that starts on a 64-byte boundary.
 
-    Dr.Jit uses NumPy's memory as it is and compiles its alignment into the kernel: arrays that happen to lie elsewhere would
-    compile the same kernel again.
+    Dr.Jit uses NumPy's memory as it is and compiles its alignment into the kernel: arrays that happen to lie
+    elsewhere would compile the same kernel again.
     """
     flat = np.asarray(values, dtype=dtype).ravel()
     room = np.empty(flat.nbytes + 64, dtype=np.uint8)
@@ -73,8 +73,8 @@ def _aligned(values: Any, dtype: Any) -> np.ndarray:
 def parameter(value: Any) -> Any:
     """A width-1 ``Float`` that kernels read from memory.
 
-    A literal would be compiled into the kernel, and every new atmosphere would compile it again. Dr.Jit values pass through
-    with their gradient.
+    A literal would be compiled into the kernel, and every new atmosphere would compile it again. Dr.Jit values pass
+    through with their gradient.
     """
     import drjit as dr
 
@@ -87,7 +87,8 @@ def parameter(value: Any) -> Any:
 
 
 def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]:
-    """``count`` consecutive floats starting at ``index * count``, as a list of Floats: packet loads where the count allows."""
+    """``count`` consecutive floats starting at ``index * count``, as a list of Floats: packet loads where the count
+    allows."""
     import drjit as dr
 
     t = types()

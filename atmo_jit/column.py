@@ -1,15 +1,16 @@
 """Column densities (m) of every constituent from any point to the sun: one small table per atmosphere's profiles.
 
-Columns, not transmittance, are stored: exp(-sum beta_k N_k) neither underflows nor divides 0 by 0 in haze, and coefficients,
-wavelengths and ozone amount drop out of the table.
+Columns, not transmittance, are stored: exp(-sum beta_k N_k) neither underflows nor divides 0 by 0 in haze, and
+coefficients, wavelengths and ozone amount drop out of the table.
 
-Only rays that rise (mu >= 0) are tabulated. A ray that descends passes its perigee at altitude h_p and rises again, so that
-N(h, -mu) = 2 N(h_p, 0) - N(h, mu). What is stored is the mean density along the path to the top, N / d_top: finite and smooth
-up to the top, where both vanish, and constant in mu for a flat layer.
+Only rays that rise (mu >= 0) are tabulated. A ray that descends passes its perigee at altitude h_p and rises again,
+so that N(h, -mu) = 2 N(h_p, 0) - N(h, mu). What is stored is the mean density along the path to the top, N / d_top:
+finite and smooth up to the top, where both vanish, and constant in mu for a flat layer.
 
-Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends. Just below a kink
-a horizontal ray's column has a root, sqrt(h_break - h): rows lie at h_break - width x^2, and profiles with kinks are interpolated
-linearly in x, which is exact for the root. Exponential profiles have no kinks; the logarithm of their mean is interpolated linearly in h.
+Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends.
+Just below a kink a horizontal ray's column has a root, sqrt(h_break - h): rows lie at h_break - width x^2, and
+profiles with kinks are interpolated linearly in x, which is exact for the root. Exponential profiles have no kinks;
+the logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ _CELLS = 4096  # of the look-up from altitude to shell, uniform in the cube root
 class SunColumns:
     """Table of mean densities over altitude and mu in [0, 1] (logarithmic from the horizontal); bilinear.
 
-    ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} - 1), fine where the
-    thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
+    ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} -
+    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
     """
 
     def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128)) -> None:
@@ -76,8 +77,8 @@ class SunColumns:
     def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
         """Column density (m) of every constituent from altitude ``h`` to the top in direction ``mu`` of either sign.
 
-        A ray that would pass below the ground is lifted to its horizon, the ray that grazes the ground: while the sun's centre is
-        below the horizon, the part of the disc still seen is there.
+        A ray that would pass below the ground is lifted to its horizon, the ray that grazes the ground: while the
+        sun's centre is below the horizon, the part of the disc still seen is there.
         """
         if not self._count:
             return []
@@ -119,7 +120,8 @@ class SunColumns:
 
 
 def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:
-    """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the profile's breaks."""
+    """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the
+    profile's breaks."""
     t = types()
     breaks = floats(optics.breaks_m)
     x, w = gauss_legendre(NODES_PER_LAYER)

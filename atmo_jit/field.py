@@ -1,8 +1,9 @@
-"""The solved radiance field: harmonic moments of the light of all orders at the nodes, and what it scatters toward a view ray.
+"""The solved radiance field: harmonic moments of the light of all orders at the nodes, and what it scatters toward a
+view ray.
 
-A field stores, per altitude node, sun node and channel, a positive reference (the zeroth moment of order 1) and every moment divided by it.
-The reference is interpolated in its logarithm, the quotients linearly: at twilight light falls by a factor of two per degree, and linear
-interpolation of the moments themselves would be wrong by 8 %.
+A field stores, per altitude node, sun node and channel, a positive reference (the zeroth moment of order 1) and every
+moment divided by it. The reference is interpolated in its logarithm, the quotients linearly: at twilight light falls
+by a factor of two per degree, and linear interpolation of the moments themselves would be wrong by 8 %.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from .refinement import Order, Refinement
 class Field:
     """The light of a sum of orders at the refined nodes.
 
-    ``first``: order 1, at its own suns; ``rest``: the sum of the later orders that scatter once more (None: there are none), ``arriving``: their
-    sky irradiance [K, S, size], which may be of one order more. ``scatters``: whether any of it scatters once more.
+    ``first``: order 1, at its own suns; ``rest``: the sum of the later orders that scatter once more (None: there are
+    none), ``arriving``: their sky irradiance [K, S, size], which may be of one order more. ``scatters``: whether any
+    of it scatters once more.
     """
 
     def __init__(
@@ -49,7 +51,12 @@ class Field:
             return
         self.degree = first.degree
         self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
-        self.moments = _sum(refine.both(first.moments, suns[0], first.degree), first, refine.both(rest.moments, suns[1], rest.degree), rest)
+        self.moments = _sum(
+            refine.both(first.moments, suns[0], first.degree),
+            first,
+            refine.both(rest.moments, suns[1], rest.degree),
+            rest,
+        )
         self._chi = optics.phase_moments(self.degree, padded(optics.channel_count))
         l_, m = pairs(self.degree)
         rows = [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
@@ -57,7 +64,8 @@ class Field:
         dr.eval(self.sky, self.reflected, self.moments)
 
     def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
-        """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude [2][channel]."""
+        """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
+        [2][channel]."""
         suns, size = self.grid.sources, padded(self.optics.channel_count)
         k, fk = self.grid.locate_altitude(h)
         s, fs = self.grid.locate_sun(mu_s)
@@ -69,7 +77,8 @@ class Field:
         return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
 
     def _per_depth(self, irradiance: Any, suns: int) -> Any:
-        """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish, and smooth up to it."""
+        """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish,
+        and smooth up to it."""
         t, size = types(), padded(self.optics.channel_count)
         altitudes = self.grid.shape[0]
         above = self._depth_above(floats(self.grid.h))
@@ -105,7 +114,8 @@ class Field:
         ]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
-        """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel] (march.Source)."""
+        """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel]
+        (march.Source)."""
         t = types()
         channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
         size = padded(channels)
@@ -140,7 +150,8 @@ class Field:
 
         width = dr.width(h)
         zero, one = dr.zeros(t.Float, width), dr.full(t.Float, 1.0, width)
-        # cos(0 phi) = 1, and cos(-1 phi) = cos phi starts the recurrence cos((m + 1) phi) = 2 cos phi cos(m phi) - cos((m - 1) phi).
+        # cos(0 phi) = 1, and cos(-1 phi) = cos phi starts the recurrence cos((m + 1) phi) = 2 cos phi cos(m phi) -
+        # cos((m - 1) phi).
         state = (
             t.UInt(0),
             one * 0.28209479,

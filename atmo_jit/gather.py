@@ -1,9 +1,10 @@
 """The step from one order of scattering to the next, along straight paths between the nodes.
 
-For visit t of a path and sun s there: G_m = sum_l P_lm(mu_t) (sum_c W_c chi_l^c) L_lm(h_t, s); the radiance at the path's origin is
-the sum over t and m of cos(m phi_t) G_m(t, s_t). The weights W contain all optics and no sun; sun angle s_t and azimuth phi_t at a
-visit are geometry. Ground reflection joins m = 0 at the last visit of a path that ends on the ground. G is tabulated at the solved suns
-and interpolated cubically between them: its table stays small enough for the cache.
+For visit t of a path and sun s there: G_m = sum_l P_lm(mu_t) (sum_c W_c chi_l^c) L_lm(h_t, s); the radiance at the
+path's origin is the sum over t and m of cos(m phi_t) G_m(t, s_t). The weights W contain all optics and no sun; sun
+angle s_t and azimuth phi_t at a visit are geometry. Ground reflection joins m = 0 at the last visit of a path that
+ends on the ground. G is tabulated at the solved suns and interpolated cubically between them: its table stays small
+enough for the cache.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from .refinement import Order, Refinement
 
 
 class Samples:
-    """Where sun and azimuth stand at every visit of the paths, for every solved sun and azimuth: geometry that serves every order.
+    """Where sun and azimuth stand at every visit of the paths, for every solved sun and azimuth: geometry that serves
+    every order.
 
     ``sun``: coordinate in units of the solved suns, ``cos_phi``: [visits, S, azimuths].
     """
@@ -113,7 +115,8 @@ class Gather:
         return stored([dr.maximum(s, 0.0) for s in sums], lane, size)
 
     def _contract(self, moments: Any, sky: Any, degree: int) -> Any:
-        """G [visits, S + 2, m, size] over the reference: ``moments`` [levels, S, pairs, size] seen along each path, weighed and summed over l.
+        """G [visits, S + 2, m, size] over the reference: ``moments`` [levels, S, pairs, size] seen along each path,
+        weighed and summed over l.
 
         The first sun mirrors the second (the sun has passed through the zenith: (-1)^m), the last goes straight on.
         """
@@ -128,7 +131,9 @@ class Gather:
         for n in range(kinds):
             moment = packet(chi, l_ * kinds + n, size)
             for c in range(channels):
-                products[c] = dr.fma(dr.gather(t.Float, self._weights.weights[n * channels + c], visit), moment[c], products[c])
+                products[c] = dr.fma(
+                    dr.gather(t.Float, self._weights.weights[n * channels + c], visit), moment[c], products[c]
+                )
         weights = stored(products, lane, size)
 
         basis = self.samples.basis(degree)
@@ -158,10 +163,15 @@ class Gather:
         lane = dr.arange(t.UInt, visits * orders)
         m, start = lane % orders, lane // orders * (suns + 2)
         mirrored = packet(table, (start + 2) * orders + m, size)
-        last, before = packet(table, (start + suns) * orders + m, size), packet(table, (start + suns - 1) * orders + m, size)
+        last, before = (
+            packet(table, (start + suns) * orders + m, size),
+            packet(table, (start + suns - 1) * orders + m, size),
+        )
         sign = dr.select(m % 2 == 1, -1.0, 1.0)
         scatter_packet(table, [sign * v for v in mirrored], start * orders + m, size)
-        scatter_packet(table, [2.0 * a - b for a, b in zip(last, before, strict=True)], (start + suns + 1) * orders + m, size)
+        scatter_packet(
+            table, [2.0 * a - b for a, b in zip(last, before, strict=True)], (start + suns + 1) * orders + m, size
+        )
         dr.eval(table)
         return table
 
@@ -169,4 +179,9 @@ class Gather:
 def _cubic(f: Any) -> list[Any]:
     """Catmull-Rom weights of the four nodes about a fraction ``f`` of the middle interval."""
     g = 1.0 - f
-    return [-0.5 * f * g * g, dr.fma(f * f, dr.fma(1.5, f, -2.5), 1.0), dr.fma(g * g, dr.fma(1.5, g, -2.5), 1.0), -0.5 * g * f * f]
+    return [
+        -0.5 * f * g * g,
+        dr.fma(f * f, dr.fma(1.5, f, -2.5), 1.0),
+        dr.fma(g * g, dr.fma(1.5, g, -2.5), 1.0),
+        -0.5 * g * f * f,
+    ]

@@ -1,8 +1,9 @@
 """Altitude-first arithmetic on a sphere: the only place where single precision could go wrong.
 
-A point is given by its altitude ``h`` above a planet of radius ``R``, never by its radius ``r = R + h`` alone: in float32 a radius of
-6.4e6 m has steps of 0.5 m, an altitude of 1 m has steps of 1e-7 m. Every difference of squares of radii is written as a product of
-altitudes, ``r'^2 - r^2 = (h' - h)(2R + h + h')``. ``mu`` is the cosine of the angle from the zenith.
+A point is given by its altitude ``h`` above a planet of radius ``R``, never by its radius ``r = R + h`` alone: in
+float32 a radius of 6.4e6 m has steps of 0.5 m, an altitude of 1 m has steps of 1e-7 m. Every difference of squares of
+radii is written as a product of altitudes, ``r'^2 - r^2 = (h' - h)(2R + h + h')``. ``mu`` is the cosine of the angle
+from the zenith.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import drjit as dr
 def altitude_along(radius: Any, h: Any, mu: Any, distance: Any) -> tuple[Any, Any]:
     """Altitude and radius (m) of the point ``distance`` along the ray (h, mu): h' = h + d (2 r mu + d) / (r + r').
 
-    ``radius`` is the planet's. The altitude is clipped at the ground, where rounding could put it some micrometres below.
+    ``radius`` is the planet's. The altitude is clipped at the ground, where rounding could put it some micrometres
+    below.
     """
     r = radius + h
     step = distance * dr.fma(2.0 * r, mu, distance)
@@ -29,7 +31,8 @@ def safe_sine(cosine: Any) -> Any:
 
 
 def perigee_altitude(radius: Any, h: Any, mu: Any) -> Any:
-    """Altitude (m) of the point of the whole line (h, mu) nearest to the planet's centre; negative where it is below ground.
+    """Altitude (m) of the point of the whole line (h, mu) nearest to the planet's centre; negative where it is below
+    ground.
 
     h_p = h - r mu^2 / (1 + sin): no difference of two large numbers.
     """
@@ -37,7 +40,8 @@ def perigee_altitude(radius: Any, h: Any, mu: Any) -> Any:
 
 
 def crossing_discriminant(radius: Any, h: Any, mu: Any, altitude: Any) -> Any:
-    """(r mu)^2 - (h - altitude)(2R + h + altitude), m^2: the squared distance from perigee to the crossing of ``altitude``."""
+    """(r mu)^2 - (h - altitude)(2R + h + altitude), m^2: the squared distance from perigee to the crossing of
+    ``altitude``."""
     r_mu = (radius + h) * mu
     return dr.fma(r_mu, r_mu, (altitude - h) * (2.0 * radius + h + altitude))
 

@@ -1,7 +1,9 @@
-"""The nodes on which the radiance field is solved: altitudes and sun zenith angles, placed where a given atmosphere needs them.
+"""The nodes on which the radiance field is solved: altitudes and sun zenith angles, placed where a given atmosphere
+needs them.
 
-Altitude nodes are uniform in a coordinate u(h) that grows with the scattering matter passed, flattened so that the thin upper air gets its
-share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta), dense around the twilight.
+Altitude nodes are uniform in a coordinate u(h) that grows with the scattering matter passed, flattened so that the
+thin upper air gets its share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta), dense around
+the twilight.
 """
 
 from __future__ import annotations
@@ -25,15 +27,17 @@ _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by
 class Grid:
     """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
 
-    The field is solved at K altitudes and S suns, and interpolated, cubically, to the refined ``levels`` and ``sources`` suns, on which
-    light is then looked up linearly. Order 1, which knows the sun's disc, is solved at ``first_theta``, several times as many suns.
+    The field is solved at K altitudes and S suns, and interpolated, cubically, to the refined ``levels`` and
+    ``sources`` suns, on which light is then looked up linearly. Order 1, which knows the sun's disc, is solved at
+    ``first_theta``, several times as many suns.
     """
 
     _known: ClassVar[OrderedDict[str, Grid]] = OrderedDict()
 
     @classmethod
     def of(cls, atmosphere: Atmosphere, resolution: Resolution) -> Grid:
-        """The grid for an atmosphere; the same object for atmospheres of the same shape, so that what is built on it is kept."""
+        """The grid for an atmosphere; the same object for atmospheres of the same shape, so that what is built on it
+        is kept."""
         grid = cls(atmosphere, resolution)
         key = f"{resolution} {grid.radius_m} {grid.levels.tobytes().hex()} {grid.theta.tobytes().hex()}"
         known = cls._known.setdefault(key, grid)
@@ -77,7 +81,8 @@ class Grid:
         return levels
 
     def _place_suns(self, count: int, refine: int, first: int) -> None:
-        # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for multiple.
+        # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for
+        # multiple.
         dip = np.arccos(self.radius_m / (self.radius_m + self.thickness_m))
         end = min(0.5 * np.pi + 2.2 * dip, np.pi)
         self._center, self._width = 0.5 * np.pi + 0.3 * dip, 0.8 * dip
@@ -87,11 +92,14 @@ class Grid:
         self._scale = fine / self._sun_coordinate(end)
         self.sources = fine + 1  # refined suns
         self.theta, self.first_theta = (
-            np.interp(np.linspace(0.0, fine, n), self._sun_coordinate(theta), theta) for n in (count, first * (count - 1) + 1)
+            np.interp(np.linspace(0.0, fine, n), self._sun_coordinate(theta), theta)
+            for n in (count, first * (count - 1) + 1)
         )
         self.sun_refine = refine
         self.sun_refinement, self.first_sun_refinement = (
-            np.stack([_cubic_refinement(first * (count - 1) + 1, refine // first, mirrored=sign) for sign in (1.0, -1.0)])
+            np.stack(
+                [_cubic_refinement(first * (count - 1) + 1, refine // first, mirrored=sign) for sign in (1.0, -1.0)]
+            )
             for first in (1, first)
         )
 
@@ -137,7 +145,8 @@ class Grid:
 
 
 def _rounded_depth(steps: np.ndarray) -> np.ndarray:
-    """Optical depths of thin layers, scaled to a total that is a power of two, 0 below 1/4: a small change moves no node."""
+    """Optical depths of thin layers, scaled to a total that is a power of two, 0 below 1/4: a small change moves no
+    node."""
     total = steps.sum()
     return steps * (2.0 ** np.round(np.log2(total)) / total) if total > 0.25 else 0.0 * steps
 
@@ -149,10 +158,11 @@ def _split(position: Any, count: int) -> tuple[Any, Any]:
 
 
 def _cubic_refinement(count: int, refine: int, *, mirrored: float | None) -> np.ndarray:
-    """Matrix [refine (count - 1) + 1, count]: Catmull-Rom interpolation of equidistant values at ``refine`` points per interval.
+    """Matrix [refine (count - 1) + 1, count]: Catmull-Rom interpolation of equidistant values at ``refine`` points
+    per interval.
 
-    ``mirrored``: 1 or -1 for a function even or odd about its first node (a moment cos(m phi) is (-1)^m: the sun passes through the
-    zenith); other ends go straight on.
+    ``mirrored``: 1 or -1 for a function even or odd about its first node (a moment cos(m phi) is (-1)^m: the sun
+    passes through the zenith); other ends go straight on.
     """
     matrix = np.zeros((refine * (count - 1) + 1, count))
     for row in range(len(matrix)):

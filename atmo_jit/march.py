@@ -1,8 +1,10 @@
-"""Marching along view rays: exact single scattering, the gather of multiple scattering, columns and transmittance in one pass.
+"""Marching along view rays: exact single scattering, the gather of multiple scattering, columns and transmittance in
+one pass.
 
-A ray is cut where something happens: at the altitudes where a profile has a kink or has changed by some e-folds, at its perigee, where
-it enters or leaves the planet's shadow, and wherever a channel's optical depth has grown by MAX_DEPTH. Inside a piece everything is smooth
-and four Gauss-Legendre nodes suffice, in clear air and in fog alike. Every ray stops as soon as its transmittance is spent.
+A ray is cut where something happens: at the altitudes where a profile has a kink or has changed by some e-folds, at
+its perigee, where it enters or leaves the planet's shadow, and wherever a channel's optical depth has grown by
+MAX_DEPTH. Inside a piece everything is smooth and four Gauss-Legendre nodes suffice, in clear air and in fog alike.
+Every ray stops as soon as its transmittance is spent.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
 class Rays:
     """Rays that start inside the atmosphere, with the sun's place; every member a Float or Bool array of one width.
 
-    ``h`` altitude (m) of the origin; ``mu``, ``mu_s``, ``nu``: cosines of view zenith, sun zenith (at the origin) and their angle;
-    ``stop`` distance (m) to the end; ``ground``: the ray ends on the ground.
+    ``h`` altitude (m) of the origin; ``mu``, ``mu_s``, ``nu``: cosines of view zenith, sun zenith (at the origin) and
+    their angle; ``stop`` distance (m) to the end; ``ground``: the ray ends on the ground.
     """
 
     h: Any
@@ -43,7 +45,8 @@ class Rays:
 
 @dataclass
 class Light:
-    """What a march returns, per channel: ``single`` and ``multiple`` scattered radiance and the ``transmittance`` to the end."""
+    """What a march returns, per channel: ``single`` and ``multiple`` scattered radiance and the ``transmittance`` to
+    the end."""
 
     single: list[Any]
     multiple: list[Any]
@@ -67,7 +70,8 @@ def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Ray
 
 
 def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
-    """Fraction of the solar disc above the horizon of a point at altitude ``h``: a smooth step over the disc's angular diameter.
+    """Fraction of the solar disc above the horizon of a point at altitude ``h``: a smooth step over the disc's
+    angular diameter.
 
     Bruneton 2017, GetTransmittanceToSun; a point sun (radius 0) is cut sharply.
     """
@@ -88,9 +92,10 @@ def point_along(optics: Optics, rays: Rays, distance: Any) -> tuple[Any, Any, An
 def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     """Distances along the ray where sunlight does not change smoothly; beyond ``stop`` where there is none.
 
-    The perigee of the sunbeam through a point lies at altitude k where h (2R + h) - (r mu_s)^2 = k (2R + k): along a ray a
-    quadratic in the distance, the cylinder of radius R + k about the axis through sun and planet. k = 0 is the planet's shadow; at
-    the kinks of a profile the column toward the sun has a square-root edge. Only the far side of the planet (mu_s < 0) counts.
+    The perigee of the sunbeam through a point lies at altitude k where h (2R + h) - (r mu_s)^2 = k (2R + k): along a
+    ray a quadratic in the distance, the cylinder of radius R + k about the axis through sun and planet. k = 0 is the
+    planet's shadow; at the kinks of a profile the column toward the sun has a square-root edge. Only the far side of
+    the planet (mu_s < 0) counts.
     """
     radius, r = optics.radius, optics.radius + rays.h
     a = (1.0 - rays.nu) * (1.0 + rays.nu)
@@ -114,7 +119,8 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
 
 
 class Rule:
-    """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW coarser nodes.
+    """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW
+    coarser nodes.
 
     The node count is a parameter: another one needs no other kernel.
     """
@@ -151,9 +157,9 @@ def march(
 ) -> Light:
     """Radiance scattered toward the origin of each ray, per unit of ``optics.solar``; ground light is not included.
 
-    Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's shadow.
-    ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the centroid of the
-    piece's weight, which is exact for a field that is linear there.
+    Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's
+    shadow. ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the
+    centroid of the piece's weight, which is exact for a field that is linear there.
     """
     t = types()
     c_count, k_count = optics.channel_count, len(optics.constituents)
@@ -264,7 +270,8 @@ def relative_azimuth(mu: Any, mu_s: Any, nu: Any) -> Any:
 
 
 def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
-    """Index (as a Float) of the shell [b_j, b_{j+1}] that the ray enters first: the lower one where it starts on a break and falls."""
+    """Index (as a Float) of the shell [b_j, b_{j+1}] that the ray enters first: the lower one where it starts on a
+    break and falls."""
     t = types()
     count = len(optics.breaks_m)
     falling = rays.mu < 0.0
@@ -278,7 +285,8 @@ def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
 
 
 def _largest_extinctions(optics: Optics, breaks: Any) -> Any:
-    """Largest extinction coefficient (1/m) of each shell: profiles are monotone between breaks, so it is at one of its ends."""
+    """Largest extinction coefficient (1/m) of each shell: profiles are monotone between breaks, so it is at one of
+    its ends."""
     t = types()
     count = len(optics.breaks_m)
     at_breaks = optics.largest_extinction(optics.densities(breaks))

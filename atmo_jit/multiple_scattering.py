@@ -1,8 +1,8 @@
 """Multiple scattering by orders, on angular moments instead of a four-dimensional table.
 
-Light that scatters again is needed only through the low harmonics of its angular distribution (Rayleigh needs l <= 2, aerosol of asymmetry
-g as many as g^l takes to fade). So one order is a handful of moments per altitude and sun angle, and the next follows by gathering
-along straight paths from every node.
+Light that scatters again is needed only through the low harmonics of its angular distribution (Rayleigh needs l <= 2,
+aerosol of asymmetry g as many as g^l takes to fade). So one order is a handful of moments per altitude and sun angle,
+and the next follows by gathering along straight paths from every node.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from .single_scattering import first_order
 def solve(
     optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, orders: int | None, tolerance: float
 ) -> Field:
-    """The field of the light of all orders below ``orders``: what may scatter or reflect once more on the way to an observer.
+    """The field of the light of all orders below ``orders``: what may scatter or reflect once more on the way to an
+    observer.
 
-    ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as soon as that is steady to
-    ``tolerance``. The field's sky irradiance counts one event more than its moments.
+    ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
+    soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
     """
     r, channels = resolution, optics.channel_count
     fine = directions_at(grid, r.first_up, r.first_down)
@@ -73,12 +74,14 @@ def _relative(inverse: Any, moments: Any, sky: Any, degree: int, size: int) -> O
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights [N, S, size] of the N orders [N, K, S, pairs, size] whose sum is closest to that of all orders, and its error.
+    """Weights [N, S, size] of the N orders [N, K, S, pairs, size] whose sum is closest to that of all orders, and its
+    error.
 
-    Reduced-rank extrapolation (Eddy 1979; Sidi 1991), per sun and channel: among the combinations sum_j gamma_j x_j, sum gamma_j = 1, of the
-    partial sums x_j, the one whose residual sum_j gamma_j u_{j+1} (u: the orders) is smallest. With two orders it is the geometric tail; it
-    is GMRES for the fixed point, and in a thick conservative cloud some ten orders do the work of hundreds. The error is the
-    norm of that residual over that of the sum, the largest over suns and channels that have light.
+    Reduced-rank extrapolation (Eddy 1979; Sidi 1991), per sun and channel: among the combinations sum_j gamma_j x_j,
+    sum gamma_j = 1, of the partial sums x_j, the one whose residual sum_j gamma_j u_{j+1} (u: the orders) is
+    smallest. With two orders it is the geometric tail; it is GMRES for the fixed point, and in a thick conservative
+    cloud some ten orders do the work of hundreds. The error is the norm of that residual over that of the sum, the
+    largest over suns and channels that have light.
     """
     count, _, suns, _, size = orders.shape
     u = np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1).astype(np.float64)

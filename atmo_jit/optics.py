@@ -1,7 +1,7 @@
 """An atmosphere as kernels see it: at most four wavelengths ("channels") with every value a Dr.Jit parameter.
 
-Kernels never see NumPy or JSON: they ask an :class:`Optics` for densities, phase functions and coefficients. Values are opaque to the
-compiler, so that another atmosphere of the same make-up reuses the compiled kernels.
+Kernels never see NumPy or JSON: they ask an :class:`Optics` for densities, phase functions and coefficients. Values
+are opaque to the compiler, so that another atmosphere of the same make-up reuses the compiled kernels.
 """
 
 from __future__ import annotations
@@ -20,22 +20,16 @@ from .profile import Exponential, Tabulated, Tent
 FEW_CORNERS = 8
 PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
-LEVELS = (
-    0.5,
-    1.0,
-    1.75,
-    2.5,
-    3.75,
-    5.0,
-    9.0,
-)  # scale heights at which rays are cut: the field is asked once between two cuts
+# Scale heights at which rays are cut: the field is asked once between two cuts.
+LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)
 
 
 class Optics:
     """Dr.Jit view of ``atmosphere`` at the wavelengths ``indices`` (at most MAX_CHANNELS of them).
 
-    Attributes: ``radius``, ``thickness`` (m); ``solar``, ``albedo`` (lists of C Floats); ``scattering[k]``, ``extinction[k]`` (1/m) for
-    constituent k; ``scatterers`` (indices of the constituents that scatter); ``sun_radius`` (angular, radians).
+    Attributes: ``radius``, ``thickness`` (m); ``solar``, ``albedo`` (lists of C Floats); ``scattering[k]``,
+    ``extinction[k]`` (1/m) for constituent k; ``scatterers`` (indices of the constituents that scatter);
+    ``sun_radius`` (angular, radians).
     """
 
     def __init__(self, atmosphere: Atmosphere, indices: np.ndarray) -> None:
@@ -90,7 +84,8 @@ class Optics:
         return [values[id(p)] for p in phases]
 
     def phase_table(self, degree: int, size: int) -> Any:
-        """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: [node, scatterer, size]."""
+        """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: [node,
+        scatterer, size]."""
         nu = np.linspace(-1.0, 1.0, PHASE_NODES)
         weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
         table = np.zeros((PHASE_NODES, len(self.scatterers), size))
@@ -115,7 +110,8 @@ class Optics:
 
     @cached_property
     def breaks_m(self) -> np.ndarray:
-        """Altitudes (m), ascending from 0 to the top, between which every profile is smooth and changes by a few e-folds at most."""
+        """Altitudes (m), ascending from 0 to the top, between which every profile is smooth and changes by a few
+        e-folds at most."""
         top = self.atmosphere.thickness_m
         levels = [0.0, top]
         for c in self.constituents:
@@ -135,10 +131,11 @@ class Optics:
 
     @cached_property
     def edge_levels_m(self) -> list[float]:
-        """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top, corners of tents, steps of tables.
+        """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top, corners of tents,
+        steps of tables.
 
-        The other corners of a tabulated profile count where they are few; where they are many they are slight, and are left to
-        the quadrature.
+        The other corners of a tabulated profile count where they are few; where they are many they are slight, and
+        are left to the quadrature.
         """
         top = self.atmosphere.thickness_m
         kinks: set[float] = set()

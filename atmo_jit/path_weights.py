@@ -1,4 +1,5 @@
-"""Weights of the straight paths between the nodes: density, extinction and hat functions, integrated once per atmosphere."""
+"""Weights of the straight paths between the nodes: density, extinction and hat functions, integrated once per
+atmosphere."""
 
 from __future__ import annotations
 
@@ -17,11 +18,11 @@ from .quadrature import gauss_legendre, running_integral
 class PathWeights:
     """What every visit of a path contributes to the light at its origin, for one atmosphere; no sun enters.
 
-    Between two stations the field is linear in the altitude coordinate u; each station gets its hat function's share of the integral
-    of density times transmittance over both pieces beside it.
+    Between two stations the field is linear in the altitude coordinate u; each station gets its hat function's share
+    of the integral of density times transmittance over both pieces beside it.
 
-    ``weights[n * C + c]`` [visits]: scattering by scatterer n in channel c; ``reflected[c]`` [visits]: transmittance times albedo / pi at
-    the visit where a path ends on the ground, else 0.
+    ``weights[n * C + c]`` [visits]: scattering by scatterer n in channel c; ``reflected[c]`` [visits]: transmittance
+    times albedo / pi at the visit where a path ends on the ground, else 0.
     """
 
     def __init__(self, optics: Optics, paths: Paths) -> None:

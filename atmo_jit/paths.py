@@ -1,8 +1,9 @@
-"""The straight paths along which light is gathered at the nodes: geometry only, float64 NumPy, once per planet and resolution.
+"""The straight paths along which light is gathered at the nodes: geometry only, float64 NumPy, once per planet and
+resolution.
 
-From every node altitude h_k a few directions mu leave. A path is cut where it crosses a refined level, and at its perigee: so the field is
-never interpolated in altitude except at the perigee, and everything about a path node (its altitude, zenith cosine there, angle
-travelled about the planet's centre) is independent of sun and azimuth.
+From every node altitude h_k a few directions mu leave. A path is cut where it crosses a refined level, and at its
+perigee: so the field is never interpolated in altitude except at the perigee, and everything about a path node (its
+altitude, zenith cosine there, angle travelled about the planet's centre) is independent of sun and azimuth.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from .quadrature import split_directions
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), ``facing_up`` [K, D]: those of the irradiance."""
+    """Directions at every node altitude: ``mu`` and ``weight`` [K, D] (weights sum to 2), ``facing_up`` [K, D]: those
+    of the irradiance."""
 
     mu: np.ndarray
     weight: np.ndarray
@@ -40,11 +42,13 @@ class Directions:
 class Paths:
     """Stations of all rays (k, direction), concatenated ray after ray: T stations in all, N rays.
 
-    ``first`` [N + 1]: where each ray's stations start. Per station: ``ray``, ``distance`` (m) from the ray's origin, ``mu`` (zenith cosine there),
-    ``cos_turn``, ``sin_turn`` (angle about the centre), ``u`` (altitude coordinate). Per ray: ``h``, ``mu_start``; ``ground``: it ends on it.
+    ``first`` [N + 1]: where each ray's stations start. Per station: ``ray``, ``distance`` (m) from the ray's origin,
+    ``mu`` (zenith cosine there), ``cos_turn``, ``sin_turn`` (angle about the centre), ``u`` (altitude coordinate).
+    Per ray: ``h``, ``mu_start``; ``ground``: it ends on it.
 
-    The field is looked up at visits: one per station on a level, two (the levels below and above) at a perigee. Per visit: its ``station``,
-    ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each ray's visits start. ``locate`` gives level and share of an altitude.
+    The field is looked up at visits: one per station on a level, two (the levels below and above) at a perigee. Per
+    visit: its ``station``, ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each
+    ray's visits start. ``locate`` gives level and share of an altitude.
     """
 
     first: np.ndarray
@@ -65,7 +69,8 @@ class Paths:
 
     @cached_property
     def device(self) -> SimpleNamespace:
-        """Every array as a Dr.Jit buffer, and ``turns`` [visits, 2], ``follows`` (a station follows on the same ray), ``on_ground``."""
+        """Every array as a Dr.Jit buffer, and ``turns`` [visits, 2], ``follows`` (a station follows on the same ray),
+        ``on_ground``."""
         real = ("distance", "mu", "cos_turn", "sin_turn", "u", "h", "mu_start", "factor")
         whole = ("first", "ray", "station", "level", "first_visit")
         ends = np.append(self.ray[1:] != self.ray[:-1], True)
@@ -84,7 +89,8 @@ class Paths:
 
     @classmethod
     def trace(cls, grid: Grid, directions: Directions, refine: int) -> Paths:
-        """Trace every direction of every node altitude to the ground or the top, with ``refine`` levels per altitude interval."""
+        """Trace every direction of every node altitude to the ground or the top, with ``refine`` levels per altitude
+        interval."""
         radius, levels = grid.radius_m, grid.levels_at(refine)
         count = len(levels)
         k = np.repeat(np.arange(len(grid.h)) * refine, directions.mu.shape[1])
@@ -96,7 +102,8 @@ class Paths:
         falls = mu < 0.0
         ground = falls & (perigee <= 0.0)
 
-        # Columns of the padded table: falling through the levels from the top down, the perigee, rising through the levels.
+        # Columns of the padded table: falling through the levels from the top down, the perigee, rising through the
+        # levels.
         level = np.concatenate([levels[::-1], [0.0], levels])
         index = np.concatenate([np.arange(count)[::-1], [-1], np.arange(count)])
         falling = np.arange(2 * count + 1) < count

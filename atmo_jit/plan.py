@@ -18,11 +18,12 @@ DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shar
 class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
-    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``: parts into which cubic interpolation divides every interval of either.
-    ``up``, ``down``, ``azimuths``: directions at a node for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for
-    order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there;
-    ``beam_*``: altitude levels per interval and azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved. ``columns``: size of the
-    sun-column table (altitudes, cosines).
+    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``: parts into
+    which cubic interpolation divides every interval of either. ``up``, ``down``, ``azimuths``: directions at a node
+    for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for order 1, whose forward peak is
+    sharper; ``phase_degree``: that of the phase functions there; ``beam_*``: altitude levels per interval and
+    azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved. ``columns``: size
+    of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
@@ -47,7 +48,8 @@ class Resolution:
     def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
         """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
 
-        Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those particles scatter.
+        Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
+        particles scatter.
         """
         first = _degree(atmosphere, power=2.0, target=0.1 * tolerance)
         later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
@@ -68,7 +70,8 @@ class Resolution:
 
 
 def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
-    """Smallest offered degree beyond which share * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every scatterer."""
+    """Smallest offered degree beyond which share * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
+    scatterer."""
     needed = 2
     for constituent in atmosphere.constituents:
         if constituent.phase is None:

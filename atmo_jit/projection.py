@@ -22,9 +22,12 @@ def projection(grid: Grid, suns: int, directions: Directions, azimuths: int, deg
 
 
 class Projection:
-    """From radiance in discrete directions at the nodes to moments and irradiance: sums over azimuth, then over zenith cosine."""
+    """From radiance in discrete directions at the nodes to moments and irradiance: sums over azimuth, then over
+    zenith cosine."""
 
-    def __init__(self, grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int) -> None:
+    def __init__(
+        self, grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int
+    ) -> None:
         t = types()
         self.grid, self.suns, self.directions, self.azimuths, self.degree = grid, suns, directions, azimuths, degree
         self.size = padded(channels)
@@ -38,7 +41,8 @@ class Projection:
         self._types = t
 
     def __call__(self, radiance: Any) -> tuple[Any, Any]:
-        """``radiance`` [K, D, S, azimuths, channels] -> moments [K, S, pairs, channels], irradiance [K, S, channels]."""
+        """``radiance`` [K, D, S, azimuths, channels] -> moments [K, S, pairs, channels], irradiance [K, S,
+        channels]."""
         t, size = self._types, self.size
         altitudes, suns = self.grid.shape[0], self.suns
         orders, count, azimuths = self.degree + 1, self.count, self.azimuths

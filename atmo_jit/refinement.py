@@ -17,7 +17,8 @@ STEEPEST = 1.2  # e-folds of the reference from one sun node to the next
 class Order:
     """Light of one order, or a sum of orders, at the solved nodes, divided by the reference.
 
-    ``moments`` [K, S, pairs(degree), size] and ``sky`` irradiance [K, S, size]; ``size``: channels, padded. S: the suns of the solve, or of order 1.
+    ``moments`` [K, S, pairs(degree), size] and ``sky`` irradiance [K, S, size]; ``size``: channels, padded. S: the
+    suns of the solve, or of order 1.
     """
 
     def __init__(self, moments: Any, sky: Any, degree: int, size: int) -> None:
@@ -54,9 +55,10 @@ def combined(orders: list[Order], weights: np.ndarray) -> Order:
 class Refinement:
     """Cubic interpolation between the solved nodes, of quotients over the reference.
 
-    Linear interpolation between the solved nodes would bias the twilight by some tenths of a per cent; solving at the refined ones costs
-    several times as much. ``log_reference`` [levels, sources, size]; ``inverse`` [K, S, size] and ``first_inverse`` (at the suns of order 1):
-    1 / reference. The reference, given at the suns of order 1, guides only: it carries no derivative.
+    Linear interpolation between the solved nodes would bias the twilight by some tenths of a per cent; solving at the
+    refined ones costs several times as much. ``log_reference`` [levels, sources, size]; ``inverse`` [K, S, size] and
+    ``first_inverse`` (at the suns of order 1): 1 / reference. The reference, given at the suns of order 1, guides
+    only: it carries no derivative.
     """
 
     def __init__(self, grid: Grid, reference: np.ndarray) -> None:
@@ -77,7 +79,8 @@ class Refinement:
         return self._along(values, self._altitudes, count, len(self.grid.levels), inner, 1, None)
 
     def both(self, values: Any, suns: int, degree: int | None = None) -> Any:
-        """[K, S, pairs(degree) or nothing, size] -> [levels, sources, ...], S being ``suns``: that of the solve or that of order 1."""
+        """[K, S, pairs(degree) or nothing, size] -> [levels, sources, ...], S being ``suns``: that of the solve or
+        that of order 1."""
         values = self.altitudes(values)
         taps = self._suns if suns == self.grid.shape[1] else self._first_suns
         inner = dr.width(values) // (len(self.grid.levels) * suns * self.size)
@@ -104,7 +107,8 @@ class Refinement:
     def _along(
         self, values: Any, taps: tuple[Any, Any], count: int, refined: int, inner: int, outer: int, odd: Any
     ) -> Any:
-        """Interpolate the second axis of [outer, count, inner, size]; ``odd`` [inner]: 1 where a value is odd about the first node."""
+        """Interpolate the second axis of [outer, count, inner, size]; ``odd`` [inner]: 1 where a value is odd about
+        the first node."""
         t, size = types(), self.size
         lane = dr.arange(t.UInt, outer * refined * inner)
         item, rest = lane % inner, lane // inner
@@ -119,7 +123,8 @@ class Refinement:
 
 
 def _taps(matrices: np.ndarray) -> tuple[Any, Any]:
-    """Banded matrices [variants, rows, columns] as the first column of every row and its four weights [variants, rows, 4]."""
+    """Banded matrices [variants, rows, columns] as the first column of every row and its four weights [variants,
+    rows, 4]."""
     first = np.minimum(np.argmax(np.any(matrices != 0, axis=0), axis=1), matrices.shape[2] - 4)
     columns = np.broadcast_to(first[:, None] + np.arange(4), (len(matrices), len(first), 4))
     return uints(first), floats(np.take_along_axis(matrices, columns, axis=2))

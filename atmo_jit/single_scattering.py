@@ -21,7 +21,8 @@ from .quadrature import cosine_interpolation, half_circle
 
 
 class Sunbeam:
-    """Direct sunlight at altitude levels: transmittance toward the sun times the visible part of its disc, linear in mu_s.
+    """Direct sunlight at altitude levels: transmittance toward the sun times the visible part of its disc, linear in
+    mu_s.
 
     ``table`` [levels, COSINES, size]: from the lowest mu_s at which the top still sees the sun up to 1.
     """
@@ -40,7 +41,9 @@ class Sunbeam:
         mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
         seen = visible_sun(optics, h, optics.radius + h, mu_s)
         depths = optics.optical_depths(columns.toward(h, mu_s))
-        self._table = stored([seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)], lane, self.size)
+        self._table = stored(
+            [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)], lane, self.size
+        )
 
     def at(self, level: Any, mu_s: Any) -> list[Any]:
         """Irradiance normal to the beam per channel, at a level and a sun cosine; 0 below the lowest."""
@@ -57,11 +60,11 @@ class Sunbeam:
 def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Directions, r: Resolution) -> Any:
     """Radiance of order 1 at the nodes, [K, D, S, first_azimuths, size]: single scattering and directly lit ground.
 
-    Without its phase function, single scattering changes slowly with azimuth: it is gathered along the paths at a few azimuths,
-    interpolated by its cosine series, and only then multiplied by the phase function of the angle to the sun. Phase functions are
-    smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed by them.
+    Without its phase function, single scattering changes slowly with azimuth: it is gathered along the paths at a few
+    azimuths, interpolated by its cosine series, and only then multiplied by the phase function of the angle to the
+    sun. Phase functions are smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed
+    by them.
     """
-    t = types()
     paths = paths_along(grid, directions, r.beam_refine)
     weights = PathWeights(optics, paths)
     beam = Sunbeam(optics, columns, grid.levels_at(r.beam_refine))
@@ -70,7 +73,8 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
 
 
 def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, grid: Grid, azimuths: int) -> Any:
-    """Scattered sunlight per scatterer without its phase function, then light from the ground: [rays, S, azimuths, 1 + scatterers, size]."""
+    """Scattered sunlight per scatterer without its phase function, then light from the ground: [rays, S, azimuths, 1
+    + scatterers, size]."""
     t = types()
     kinds, channels, size = len(optics.scatterers), optics.channel_count, beam.size
     suns = len(grid.first_theta)
@@ -78,10 +82,17 @@ def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeight
     azimuth, rest = lane % azimuths, lane // azimuths
     sun, ray = rest % suns, rest // suns
     mu_s = dr.gather(t.Float, floats(np.cos(grid.first_theta)), sun)
-    across = dr.gather(t.Float, floats(np.sin(grid.first_theta)), sun) * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
+    across = dr.gather(t.Float, floats(np.sin(grid.first_theta)), sun) * dr.gather(
+        t.Float, floats(np.cos(half_circle(azimuths))), azimuth
+    )
     visits = len(paths.station)
     device = paths.device
-    rows = stored([weights.weights[n * channels + c] if c < channels else t.Float(0.0) for n in range(kinds) for c in range(size)] or [t.Float(0.0)], dr.arange(t.UInt, visits), max(kinds * size, 1))
+    rows = stored(
+        [weights.weights[n * channels + c] if c < channels else t.Float(0.0) for n in range(kinds) for c in range(size)]
+        or [t.Float(0.0)],
+        dr.arange(t.UInt, visits),
+        max(kinds * size, 1),
+    )
     start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
 
     def turned(visit: Any) -> Any:
@@ -91,7 +102,11 @@ def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeight
     def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         light = beam.at(dr.gather(t.UInt, device.level, i), turned(i))
         weight = packet(rows, i, kinds * size)
-        return i + 1, [dr.fma(weight[n * size + c], light[c], sums[n * channels + c]) for n in range(kinds) for c in range(channels)]
+        return i + 1, [
+            dr.fma(weight[n * size + c], light[c], sums[n * channels + c])
+            for n in range(kinds)
+            for c in range(channels)
+        ]
 
     sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * channels)]
     if kinds:
@@ -100,7 +115,9 @@ def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeight
     falling_on = turned(end)
     lit = beam.at(t.UInt(0), falling_on)
     dr.make_opaque(lit)
-    reflected = [dr.gather(t.Float, weights.reflected[c], end) * dr.maximum(falling_on, 0.0) * lit[c] for c in range(channels)]
+    reflected = [
+        dr.gather(t.Float, weights.reflected[c], end) * dr.maximum(falling_on, 0.0) * lit[c] for c in range(channels)
+    ]
     blank = [t.Float(0.0)] * (size - channels)
     out = [*reflected, *blank]
     for n in range(kinds):

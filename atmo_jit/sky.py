@@ -1,7 +1,8 @@
 """The sky: everything that users, plugins, exporters and fits call.
 
 >>> import atmo_jit
->>> result = atmo_jit.sky("earth", {"altitude_m": 2.0, "sun_zenith_deg": 60.0, "view_zenith_deg": [0.0, 45.0], "azimuth_deg": 90.0})
+>>> views = {"altitude_m": 2.0, "sun_zenith_deg": 60.0, "view_zenith_deg": [0.0, 45.0], "azimuth_deg": 90.0}
+>>> result = atmo_jit.sky("earth", views)
 >>> result.radiance.shape  # views, wavelengths
 (2, 3)
 """
@@ -56,9 +57,9 @@ class _Band:
 class Sky:
     """The solved sky of an atmosphere: all sun angles, altitudes and directions. Solve once, evaluate many times.
 
-    ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted (1: single scattering
-    and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which the resolution follows unless it is given.
-    Raises AtmosphereError, LLVMError, InputError.
+    ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
+    (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
+    the resolution follows unless it is given. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -88,9 +89,10 @@ class Sky:
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
-        Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too). ``azimuth`` is the
-        view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False`` leaves the ground's own radiance out;
-        ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's ``sun_angular_radius_deg`` (nothing for a point sun).
+        Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too).
+        ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
+        leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
+        ``sun_angular_radius_deg`` (nothing for a point sun).
         """
         rays, meets_air, passes = self._enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
@@ -111,7 +113,8 @@ class Sky:
         return RayLight(radiance, transmittance)
 
     def irradiance(self, altitude_m: Any, sun_zenith: Any) -> tuple[list[Any], list[Any]]:
-        """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``: lists of W Floats."""
+        """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``:
+        lists of W Floats."""
         t = types()
         h, mu_s = t.Float(altitude_m), t.Float(dr.cos(t.Float64(sun_zenith)))
         sun, sky = [], []
@@ -126,7 +129,8 @@ class Sky:
     def _enter(
         self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any
     ) -> tuple[Rays, Any, Any]:
-        """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether they leave for space."""
+        """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether
+        they leave for space."""
         t = types()
         wide = t.Float64
         altitude, theta_s, theta, phi = (wide(v) for v in (altitude_m, sun_zenith, view_zenith, azimuth))
@@ -136,7 +140,8 @@ class Sky:
         nu = mu * mu_s + dr.sin(theta) * dr.sin(theta_s) * dr.cos(phi)
         r = radius + altitude
         outside = altitude > top
-        # Distance to the top from outside: the nearer root of d^2 + 2 r mu d + (altitude - top)(2R + altitude + top) = 0.
+        # Distance to the top from outside: the nearer root of d^2 + 2 r mu d + (altitude - top)(2R + altitude + top)
+        # = 0.
         excess = (altitude - top) * (2.0 * radius + altitude + top)
         square = (r * mu) ** 2 - excess
         meets = ~outside | ((mu < 0.0) & (square > 0.0))
@@ -175,9 +180,9 @@ class Sky:
 class SkyResult:
     """What ``sky`` returns: float32 arrays [N, W] and ``meta``.
 
-    ``radiance`` (W m^-2 sr^-1 nm^-1 for the atmosphere's solar irradiance; 1/sr where that is 1), ``transmittance`` along the ray,
-    ``sun_irradiance`` and ``sky_irradiance`` on a horizontal surface at the observer (W m^-2 nm^-1); ``meta``: version, seconds, tolerance,
-    orders, method and the plan (resolution) of the solve.
+    ``radiance`` (W m^-2 sr^-1 nm^-1 for the atmosphere's solar irradiance; 1/sr where that is 1), ``transmittance``
+    along the ray, ``sun_irradiance`` and ``sky_irradiance`` on a horizontal surface at the observer (W m^-2 nm^-1);
+    ``meta``: version, seconds, tolerance, orders, method and the plan (resolution) of the solve.
     """
 
     radiance: np.ndarray
@@ -200,13 +205,14 @@ def sky(
 ) -> SkyResult:
     """Radiance, transmittance and irradiances for a list of views.
 
-    ``atmosphere``: preset name, JSON file, dict or Atmosphere. ``views``: mapping with ``altitude_m``, ``sun_zenith_deg``, ``view_zenith_deg``,
-    ``azimuth_deg`` and optionally ``distance_m``: numbers or 1-D arrays of one length N (see atmo_jit.views). ``orders``: scattering and
-    reflection events counted (None: all, to ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the
-    sun's. ``method``: "march" integrates every ray; "auto" chooses. ``progress`` is called with the fraction done.
+    ``atmosphere``: preset name, JSON file, dict or Atmosphere. ``views``: mapping with ``altitude_m``,
+    ``sun_zenith_deg``, ``view_zenith_deg``, ``azimuth_deg`` and optionally ``distance_m``: numbers or 1-D arrays of
+    one length N (see atmo_jit.views). ``orders``: scattering and reflection events counted (None: all, to
+    ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the sun's.
+    ``method``: "march" integrates every ray; "auto" chooses. ``progress`` is called with the fraction done.
 
-    Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad atmosphere, LLVMError
-    without a usable LLVM.
+    Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad
+    atmosphere, LLVMError without a usable LLVM.
     """
     if method not in METHODS:
         raise InputError(f"method: is {method!r}; must be one of {', '.join(METHODS)}")

@@ -11,6 +11,12 @@ references were made by others' code or by brute force in double precision, none
 `bench/reference.py` says which file is what. Errors are in per cent of the reference.
 """
 
+SUMMARY = """## In short
+
+Single scattering: the largest of the figures of the sun angles named, over all altitudes, and those of Bruneton's
+2017 tables; all orders: over all rays of the kind. The sections below say against what.
+"""
+
 SINGLE = """## Single scattering
 
 The Earth of Bruneton's 2017 paper, six altitudes from 1 m to 400 km, 64 view zenith angles, 5 azimuths,
@@ -37,6 +43,28 @@ def table(rows: Iterable[Mapping], columns: Mapping[str, str]) -> str:
     lines = ["| " + " | ".join(columns.values()) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(cell(key, row.get(key)) for key in columns) + " |" for row in rows]
     return "\n".join(lines) + "\n"
+
+
+def summary(result: Mapping) -> str:
+    """The few rows that say how accurate the package is; README.md has the same."""
+    groups = {"0-80 deg": (0, 80), "88-90 deg": (88, 90), "94-100 deg": (94, 100)}
+    rows = []
+    for solver, part in (
+        ("atmo-jit", result["single_scattering"]["radiance"]),
+        ("2017 tables", result["peers"]["bruneton2017, order 1"]),
+    ):
+        for name, (low, high) in groups.items():
+            inside = [r for r in part if r["altitude_m"] == "all" and low <= r["sun_zenith_deg"] <= high]
+            worst = {key: max(r[key] for r in inside) for key in ("median", "p99", "max")}
+            rows.append({"light": f"single scattering, sun at {name}", "solver": solver, **worst})
+    plain = {"plain": "all orders, plain rays", "any flag": "all orders, twilight, horizon, limb, aureole"}
+    for solver, part in (("atmo-jit", result["sky_radiance"]), ("SASKTRAN2, do16", result["peers"]["sasktran2, do16"])):
+        for row in part:
+            if row["case"] == "all" and row["group"] in plain:
+                rows.append({**row, "light": plain[row["group"]], "solver": solver})
+    columns = {"light": "light", "solver": "solver", "median": "median %", "p95": "p95 %", "p99": "p99 %"}
+    columns |= {"max": "max %", "within_1": "within 1 %", "within_3": "within 3 %"}
+    return table(sorted(rows, key=lambda row: row["light"].startswith("all")), columns)
 
 
 def cell(key: str, value: object) -> str:
@@ -77,6 +105,8 @@ def accuracy_page(result: Mapping) -> str:
     transmittance = single["transmittance"]
     parts = [
         INTRODUCTION.format(version=__version__, seconds=result["seconds"]),
+        SUMMARY,
+        summary(result),
         SINGLE,
         table(both, {"sun_zenith_deg": "sun deg", "altitude_m": "altitude m", **error, **beside}),
         f"Transmittance of {transmittance['rays']} rays to the top: at most {transmittance['max_abs']:.1e} off.\n",

@@ -10,6 +10,7 @@ light goes back and forth between those and the planet's own ground, and that th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -101,3 +102,20 @@ def add(state: Any, parts: dict[str, Any]) -> None:
     """Add objects to a parsed scene (one that :func:`edit` has changed too)."""
     for name, value in parts.items():
         state.root.props[f"reference_{name}"] = value
+
+
+def load_reference(load: Callable[[Callable[[Any], None]], Any]) -> Any:
+    """The scene with the path-traced air; ``load(edit)`` has to read and make it, calling ``edit`` with the parser's state.
+
+    It is called twice: what the air needs to know is known only after the emitter's parameters have been read.
+    """
+    parts = planet_of(load(edit))
+
+    def edit_and_add(state: Any) -> None:
+        edit(state)
+        add(state, parts)
+
+    scene = load(edit_and_add)
+    for sensor in scene.sensors():
+        sensor.set_medium(parts["air"])
+    return scene

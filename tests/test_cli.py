@@ -107,8 +107,10 @@ def test_debug_shows_the_traceback(broken, capsys, monkeypatch, by_option):
 
 
 def test_an_interrupt_ends_with_130_and_a_line():
+    # Jobs that a shell starts in the background ignore interrupts, and so would all processes below them.
     code = (
-        "import sys, time, types, click\n"
+        "import signal, sys, time, types, click\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "@click.command()\n"
         "def command():\n"
         "    print('ready', flush=True)\n"
@@ -117,11 +119,15 @@ def test_an_interrupt_ends_with_130_and_a_line():
         "from atmo_jit.cli import main\n"
         "sys.exit(main(['info']))"
     )
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "ready\n"
-    time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            time.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()
     assert process.returncode == 130 and errors.strip() == "atmo-jit: interrupted"
 
 

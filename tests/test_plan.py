@@ -1,0 +1,26 @@
+"""What an atmosphere needs."""
+
+import atmo_jit
+from atmo_jit.plan import DEGREES, Resolution
+
+EARTH = atmo_jit.Atmosphere.load("earth")
+
+
+def suited(changes=None, tolerance=0.01):
+    return Resolution.suited(EARTH.replace(changes or {}), tolerance)
+
+
+def test_gas_alone_needs_two_moments():
+    assert suited({"mie": None}).degree == 2
+    assert suited({"mie": None}).first_degree == 2
+
+
+def test_haze_needs_more_moments_the_more_it_peaks():
+    degrees = [suited({"mie.scattering_per_m": 5e-5, "mie.phase.g": g}).first_degree for g in (0.0, 0.5, 0.8, 0.9)]
+    assert degrees == sorted(degrees) and degrees[0] < degrees[-1]
+    assert all(d in DEGREES for d in degrees)
+
+
+def test_fog_needs_more_altitudes_and_accuracy_costs():
+    assert suited({"mie.scattering_per_m": 5e-3}).altitudes > suited().altitudes
+    assert suited(tolerance=0.001).first_degree > suited().first_degree
