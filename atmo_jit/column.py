@@ -27,7 +27,7 @@ from .profile import Exponential
 from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
-_CELLS = 4096  # of the look-up from altitude to shell, uniform in the cube root of altitude
+_CELLS = 4096  # of the look-up from altitude to shell, uniform in the square root of altitude
 
 
 class SunColumns:
@@ -48,7 +48,7 @@ class SunColumns:
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
         self._rows = max(4, round(size[0] / self._shells))  # intervals per shell
-        edges = np.cbrt(breaks / atmosphere.thickness_m) * _CELLS
+        edges = np.sqrt(breaks / atmosphere.thickness_m) * _CELLS
         cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
         self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
         self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
@@ -90,10 +90,14 @@ class SunColumns:
         whole = self._rising(lowest, types().Float(0.0), sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
+    def upward(self, h: Any) -> list[Any]:
+        """Column density (m) of every constituent straight up from altitude ``h``."""
+        return self._rising(h, types().Float(1.0), True) if self._count else []
+
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
         t = types()
         cosines = self._cosines
-        position = dr.cbrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
+        position = dr.sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
         shell = t.UInt(dr.gather(t.Float, self._shell_of_cell, dr.minimum(t.UInt(position), _CELLS), active))
         _, high, _, _ = packet(self._bounds, shell, 4, active)
         shell = dr.select((h >= high) & (shell + 1 < self._shells), shell + 1, shell)

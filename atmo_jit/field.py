@@ -48,6 +48,7 @@ class Field:
         once = refine.both(self._per_depth(first.sky, suns[0]), suns[0])
         self.sky = once if arriving is None else once + refine.both(self._per_depth(arriving, suns[1]), suns[1])
         if rest is None:
+            self.reflected = dr.zeros(types().Float, dr.width(self.sky))
             return
         self.degree = first.degree
         self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
@@ -94,7 +95,7 @@ class Field:
         )
 
     def _depth_above(self, h: Any) -> list[Any]:
-        return self.optics.scattering_depths(self.columns.toward(h, types().Float(1.0)))
+        return self.optics.scattering_depths(self.columns.upward(h))
 
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
@@ -104,14 +105,23 @@ class Field:
         channels, size = range(self.optics.channel_count), padded(self.optics.channel_count)
         if not self.optics.scatterers:
             return [0.0 * h for _ in channels]
-        nodes, weights, scales = self._corners(h, mu_s, active)
-        values = [packet(self.reflected if reflected else self.sky, node, size, active) for node in nodes]
+        suns = self.grid.sources
+        k, fk = self.grid.locate_altitude(h)
+        s, fs = self.grid.locate_sun(mu_s)
+        buffer = self.reflected if reflected else self.sky
+        logs = []
+        for node in (k * suns + s, (k + 1) * suns + s):
+            guide = [packet(self.log_reference, node + i, size, active) for i in (0, 1)]
+            values = [packet(buffer, node + i, size, active) for i in (0, 1)]
+            logs.append(
+                [
+                    dr.lerp(guide[0][c], guide[1][c], fs) + dr.log(dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30))
+                    for c in channels
+                ]
+            )
+        # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
         above = self._depth_above(h)
-        return [
-            dr.maximum(_blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in values]), 0.0)
-            * above[c]
-            for c in channels
-        ]
+        return [dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel]

@@ -55,7 +55,7 @@ class Grid:
 
     def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
         # Samples dense near the ground, so that a thin layer there is resolved too.
-        h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 3
+        h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 2
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
         rise = 0.3 * step / atmosphere.thickness_m
         depth = 0.0 * step
@@ -117,7 +117,7 @@ class Grid:
         return np.interp(self._position(np.asarray(h)), np.arange(_FINE + 1), self._u)
 
     def _position(self, h: np.ndarray) -> np.ndarray:
-        return np.cbrt(np.clip(h / self.thickness_m, 0.0, 1.0)) * _FINE
+        return np.sqrt(np.clip(h / self.thickness_m, 0.0, 1.0)) * _FINE
 
     @cached_property
     def _u_buffer(self) -> Any:
@@ -127,7 +127,7 @@ class Grid:
         """Index of the refined level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
         refine = self.refine if refine is None else refine
-        position = dr.cbrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
+        position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
         return _split(float(refine) * dr.lerp(u0, u1, position - t.Float(cell)), refine * (self.shape[0] - 1) + 1)

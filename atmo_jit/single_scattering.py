@@ -12,7 +12,7 @@ from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
 from .grid import Grid
-from .march import point_along, visible_sun
+from .march import Rays, point_along, visible_sun
 from .optics import PHASE_NODES, Optics
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
@@ -161,27 +161,34 @@ def _times_phase(optics: Optics, glow: Any, grid: Grid, directions: Directions, 
     return stored(values, lane, size)
 
 
-def ground_light(optics: Optics, columns: SunColumns, rays: Any, field: Field | None) -> list[Any]:
+def horizontal_irradiance(
+    optics: Optics, columns: SunColumns, field: Field, h: Any, mu_s: Any, *, reflected: bool = False
+) -> tuple[list[Any], list[Any]]:
+    """Irradiance of the sun and of the sky on a horizontal surface facing up at altitude ``h``, per channel, evaluated.
+
+    ``reflected``: only of the sky light whose reflection by that surface is still counted.
+    """
+    sun = sun_irradiance(optics, columns, h, mu_s)
+    sky = field.irradiance(h, mu_s, reflected=reflected)
+    dr.eval(sun, sky)
+    return sun, sky
+
+
+def ground_light(optics: Optics, columns: SunColumns, rays: Rays, field: Field) -> list[Any]:
     """Radiance of the Lambertian ground at the end of each ray, albedo E / pi; 0 for rays that do not end there."""
-    _, r, mu_s = point_along(optics, rays, rays.stop)
-    t = types()
-    h = t.Float(0.0)
-    direct = sun_irradiance(optics, columns, h, optics.radius + 0.0 * r, mu_s, rays.ground)
-    sky = (
-        field.irradiance(h + 0.0 * r, mu_s, rays.ground, reflected=True)
-        if field is not None and field.scatters
-        else [0.0] * optics.channel_count
-    )
+    _, _, mu_s = point_along(optics, rays, rays.stop)
+    # Evaluated first, so that the ground and any other surface share one kernel.
+    h = dr.zeros(types().Float, dr.width(mu_s))
+    dr.make_opaque(h, mu_s)
+    light = horizontal_irradiance(optics, columns, field, h, mu_s, reflected=True)
     return [
-        dr.select(rays.ground, optics.albedo[c] * dr.inv_pi * (direct[c] + sky[c]), 0.0)
-        for c in range(optics.channel_count)
+        dr.select(rays.ground, albedo * dr.inv_pi * (sun + sky), 0.0)
+        for albedo, sun, sky in zip(optics.albedo, *light, strict=True)
     ]
 
 
-def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, r: Any, mu_s: Any, active: Any = True) -> list[Any]:
+def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> list[Any]:
     """Irradiance of direct sunlight on a horizontal surface facing up at altitude ``h``, per channel."""
-    fraction = visible_sun(optics, h, r, mu_s) * dr.maximum(mu_s, 0.0)
-    depths = (
-        optics.optical_depths(columns.toward(h, mu_s, active)) if optics.constituents else [0.0] * optics.channel_count
-    )
+    fraction = visible_sun(optics, h, optics.radius + h, mu_s) * dr.maximum(mu_s, 0.0)
+    depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
     return [solar * fraction * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]

@@ -27,7 +27,7 @@ from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve
 from .optics import MAX_CHANNELS, Optics
 from .plan import Resolution
-from .single_scattering import ground_light, sun_irradiance
+from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views
 
 METHODS = ("auto", "march")
@@ -100,6 +100,7 @@ class Sky:
         for band in self._bands:
             optics = band.optics
             light = march(optics, band.columns, rays, source=band.source)
+            dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
                 light.single[c] = light.single[c] + light.multiple[c]
             if ground:
@@ -117,13 +118,13 @@ class Sky:
         lists of W Floats."""
         t = types()
         h, mu_s = t.Float(altitude_m), t.Float(dr.cos(t.Float64(sun_zenith)))
+        h = dr.minimum(h + 0.0 * mu_s, self._bands[0].optics.thickness)
+        dr.make_opaque(h, mu_s)
         sun, sky = [], []
         for band in self._bands:
-            optics = band.optics
-            inside = h < optics.thickness
-            level = dr.minimum(h, optics.thickness)
-            sun += sun_irradiance(optics, band.columns, h, optics.radius + h, mu_s)
-            sky += [dr.select(inside, value, 0.0) for value in band.field.irradiance(level, mu_s)]
+            direct, scattered = horizontal_irradiance(band.optics, band.columns, band.field, h, mu_s)
+            sun += direct
+            sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky
 
     def _enter(

@@ -20,7 +20,7 @@ has Y = 1 and the linear sRGB value (1.2048, 0.9483, 0.9091) that Mitsuba's spec
 applied.
 
 How good three wavelengths are (680, 550, 440 nm; tests/plugins/test_spectrum.py): skylight of up to 2 air masses is
-right within 5 % of its brightest channel, the sun's red is 3 % too bright at 1 air mass and 27 % at 10, because
+right within 5 % of its brightest channel, the sun's red is 2 % too bright at 1 air mass and 27 % at 10, because
 transmittance is convex in between and the ozone band at 600 nm is missed. Ten wavelengths are right within 2 %.
 
 Colour matching functions, the solar spectrum and the sRGB matrix come from colour-science, imported on first use.

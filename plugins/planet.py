@@ -41,7 +41,7 @@ from . import plugin_class
 from .variants import bound
 from .wavelengths import Wavelengths
 
-SUNS = ("unit", "solar", "colour")
+SUNS = ("unit", "solar", "colour", "each")
 MESH_RADIUS_M = 1500e3
 SECTORS = 96
 STEP = 1.08  # ratio of the radii of neighbouring rings of vertices
@@ -94,8 +94,11 @@ def light_of(
     atmosphere: Atmosphere, sun: str, channels: Sequence[int] | None
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
     """The wavelengths in use, sunlight [C, U] that gives each of them its part of the picture, and the nm of C in spectral variants."""
-    irradiance = np.ones_like(atmosphere.solar_irradiance) if sun == "unit" else atmosphere.solar_irradiance
+    irradiance = np.ones_like(atmosphere.solar_irradiance) if sun in ("unit", "each") else atmosphere.solar_irradiance
     basis = SpectralBasis.of(atmosphere)
+    if sun == "each":
+        count = len(basis.grid_nm) if mi.is_spectral else len(mi.UnpolarizedSpectrum(0.0))
+        return list(range(len(irradiance))), np.ones((count, len(irradiance))), basis.grid_nm
     if mi.is_spectral:
         matrix = basis.matrix(basis.grid_nm)
         if sun == "unit":
@@ -133,7 +136,9 @@ def planet(
     sun: what light the sun gives. ``"unit"``: irradiance 1 in every channel, so that a picture is radiance in 1/sr, each channel at its
         own wavelength (see ``channels`` of ``atmosphere_medium``). ``"solar"``: the same with the atmosphere's irradiance at that
         wavelength. ``"colour"``: the colours of the emitter ``atmosphere``; then every path has one of the wavelengths, according to
-        its time, and the sensor needs ``shutter_open`` 0 and ``shutter_close`` 1 (spectral variants: any shutter).
+        its time. ``"each"``: irradiance 1 whatever the path's wavelength is, for those who choose the time of every ray
+        themselves. Except with ``"unit"`` and ``"solar"`` in mono variants, which have but one wavelength, the sensor
+        needs ``shutter_open`` 0 and ``shutter_close`` 1.
     sun_radius_deg: angular radius of the sun's disc, 0 for parallel light.
     channels: as for ``atmosphere_medium``.
     """

@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -46,9 +47,25 @@ def test_the_readme_starts_with_two_complete_commands():
     assert readme.index(commands[1]) < 600
 
 
+def test_the_readmes_accuracy_is_what_was_measured():
+    tables = [
+        [line for line in (ROOT / name).read_text(encoding="utf-8").splitlines() if line.startswith(("| single", "| all"))]
+        for name in ("README.md", "docs/accuracy.md")
+    ]
+    assert len(tables[0]) == 5 and tables[0] == tables[1][:5]
+
+
 @pytest.mark.slow
-def test_the_readmes_example_runs():
+def test_the_readmes_examples_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-    assert len(example.strip().splitlines()) <= 15
-    exec(compile(example, "README.md", "exec"), {})
+    table, plugin = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert len(table.strip().splitlines()) <= 15
+    exec(compile(table, "README.md", "exec"), {})
+    exec(compile(plugin, "README.md", "exec"), names := {})
+    assert (tmp_path / "ball.exr").is_file()
+
+    (emitter,) = re.findall(r"```xml\n(.*?)```", readme, re.DOTALL)
+    scene = names["mi"].load_string(f'<scene version="3.9.0">{emitter}</scene>')
+    first, second = (np.array(names["mi"].traverse(s.emitters()[0])["sky_radiance"]) for s in (scene, names["scene"]))
+    assert np.array_equal(first, second)

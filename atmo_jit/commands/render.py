@@ -21,6 +21,10 @@ from atmo_jit.progress import progress_bar
 
 # Camera samples of one pass: bounds the memory (about 0.1 KiB each) and keeps the bar moving on small machines.
 PASS_SAMPLES = 2**21
+# The same for the path-traced medium, whose samples need more memory.
+REFERENCE_PASS_SAMPLES = 2**19
+# Seconds between the pictures that a --reference render leaves on the way.
+KEEP_SECONDS = 20.0
 # A picture takes at least this many passes where it has the samples for it, so that the bar moves.
 LEAST_PASSES = 16
 
@@ -35,6 +39,10 @@ LEAST_PASSES = 16
 @click.option(
     "-D", "definitions", multiple=True, metavar="NAME=VALUE", help="Set a parameter of the scene; repeatable."
 )
+@click.option("--reference", is_flag=True, help="Path-trace the air in place of the emitter `atmosphere`.")
+@click.option(
+    "--standard-error", is_flag=True, help="Also write X.error.exr: the standard error of every pixel and channel."
+)
 @click.option("--exposure", type=float, default=0.0, metavar="EV", help="Stops around the PNG's automatic exposure.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @click.option("--list", "list_scenes", is_flag=True, help="Name the shipped scenes and stop.")
@@ -46,6 +54,8 @@ def command(
     height: int | None,
     variant: str,
     definitions: tuple[str, ...],
+    reference: bool,
+    standard_error: bool,
     exposure: float,
     quiet: bool,
     list_scenes: bool,
@@ -55,6 +65,10 @@ def command(
     \b
     atmo-jit render noon --out noon.exr
     atmo-jit render sunset --out sunset.exr --spp 256 --width 1280 -D "sun=0, 1, 0.02"
+
+    With --reference the air is a medium that light is traced through, path by path: the same picture from other
+    mathematics, with noise. It is written after the first passes and again from time to time, so that an interrupted
+    render leaves the picture of the passes done.
     """
     if list_scenes:
         for name, path in scenes.shipped().items():
@@ -70,26 +84,44 @@ def command(
     path = scenes.find(scene)
     parameters = _parameters(definitions)
 
+    error = check_output(out.with_suffix(".error.exr"), ".exr") if standard_error else None
+
     started = time.perf_counter()
-    with _mitsuba(variant):
-        from atmo_jit.scenes.reader import load_scene
-
-        loaded = load_scene(path, parameters, width=width, height=height)
-        with progress_bar(f"rendering {path.stem}", quiet=quiet) as advance:
-            picture, samples = render_picture(loaded, spp, advance)
-    seconds = time.perf_counter() - started
-
     metadata = {
         "software": f"atmo-jit {__version__}",
         "scene": path.name,
         "parameters": " ".join(f"{name}={value}" for name, value in parameters.items()),
         "variant": variant,
-        "samplesPerPixel": samples,
-        "renderSeconds": seconds,
+        "reference": str(reference).lower(),
     }
-    with atomic_outputs(exr, png) as (exr_part, png_part):
-        write_exr(exr_part, picture, metadata)
-        write_png(png_part, display(picture.rgb, exposure))
+
+    def write(passes: Passes) -> Picture:
+        """The picture of the passes done, to all files."""
+        picture = passes.picture()
+        extra = {"samplesPerPixel": passes.samples, "renderSeconds": time.perf_counter() - started}
+        with atomic_outputs(exr, png, *([error] if error else [])) as parts:
+            write_exr(parts[0], picture, metadata | extra)
+            write_png(parts[1], display(picture.rgb, exposure))
+            if error:
+                write_exr(parts[2], passes.standard_error(), metadata | extra)
+        return picture
+
+    with _mitsuba(variant):
+        loaded = _load(path, parameters, width, height, reference)
+        passes = Passes(loaded, spp, REFERENCE_PASS_SAMPLES if reference else PASS_SAMPLES)
+        with progress_bar(f"rendering {path.stem}", quiet=quiet) as advance:
+            written = started
+            try:
+                for _ in passes.run(advance):
+                    if reference and time.perf_counter() - written > KEEP_SECONDS:
+                        write(passes)
+                        written = time.perf_counter()
+            except KeyboardInterrupt:
+                if reference and passes.samples:
+                    write(passes)
+                    _warn(f"interrupted: {exr.name} holds {passes.samples} of {passes.total} samples per pixel")
+                raise
+        picture = write(passes)
     invalid = int(picture.invalid.sum())
     if invalid:
         _warn(
@@ -97,7 +129,19 @@ def command(
         )
     if not quiet:
         rows, columns = picture.pixels.shape[:2]
-        click.echo(f"{out} and {png.name}: {columns}x{rows}, {samples} samples per pixel, {seconds:.1f} s")
+        seconds = time.perf_counter() - started
+        click.echo(f"{out} and {png.name}: {columns}x{rows}, {passes.samples} samples per pixel, {seconds:.1f} s")
+
+
+def _load(path: Path, parameters: dict[str, str], width: int | None, height: int | None, reference: bool) -> Any:
+    """The scene of a file, for ``reference`` with the path-traced air in it."""
+    from atmo_jit.scenes.reader import load_scene
+
+    if not reference:
+        return load_scene(path, parameters, width=width, height=height)
+    from atmo_jit.plugins.reference import load_reference
+
+    return load_reference(lambda edit: load_scene(path, parameters, width=width, height=height, edit=edit))
 
 
 def render_picture(scene: Any, spp: int | None, advance: Callable[[float], None]) -> tuple[Picture, int]:
@@ -106,31 +150,73 @@ def render_picture(scene: Any, spp: int | None, advance: Callable[[float], None]
     spp: samples per pixel, None for the sensor's own number. Samplers that cannot take a number take the next larger
         one; the second result is the number really used.
     advance: called with the fraction done after every pass.
+    """
+    passes = Passes(scene, spp)
+    for _ in passes.run(advance):
+        continue
+    return passes.picture(), passes.samples
+
+
+class Passes:
+    """A picture in passes of different seeds, with the scene's integrator and first sensor.
 
     The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
-    estimate that one pass with all samples would give.
+    estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all.
     """
-    integrator, sensor = scene.integrator(), scene.sensors()[0]
-    film, sampler = sensor.film(), sensor.sampler()
-    total, done = spp or sampler.sample_count(), 0
-    pixels = int(np.prod(film.crop_size()))
-    sums: np.ndarray | float = 0.0
-    samples = 0
-    for seed, count in enumerate(pass_sizes(total, pixels)):
-        integrator.render(scene, sensor, seed=seed, spp=count, develop=False, evaluate=True)
-        sums = sums + np.array(film.develop(raw=True), dtype=np.float64)
-        samples += sampler.sample_count()
-        done += count
-        advance(done / total)
-    return _developed(film, sums), samples
+
+    def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES) -> None:
+        self._scene, self._sensor = scene, scene.sensors()[0]
+        self._film, self._sampler = self._sensor.film(), self._sensor.sampler()
+        self.total = spp or self._sampler.sample_count()
+        self._sizes = list(pass_sizes(self.total, int(np.prod(self._film.crop_size())), most))
+        if len(self._sizes) == 1 and self.total > 1:  # one pass knows no standard error
+            self._sizes = [self.total // 2, self.total - self.total // 2]
+        self.samples = 0
+        self._sums: np.ndarray | float = 0.0
+        # Of the passes' own pictures x with n samples each: sums of n x, n^2 x, n^2 x^2, n^2.
+        self._moments: list[Any] = [0.0, 0.0, 0.0, 0.0]
+
+    def run(self, advance: Callable[[float], None]) -> Iterator[None]:
+        """Render, one pass at each step; ``advance`` is called with the fraction done."""
+        done = 0
+        for seed, count in enumerate(self._sizes):
+            integrator = self._scene.integrator()
+            integrator.render(self._scene, self._sensor, seed=seed, spp=count, develop=False, evaluate=True)
+            raw = np.array(self._film.develop(raw=True), dtype=np.float64)
+            taken = self._sampler.sample_count()
+            x = _developed(self._film, raw).pixels.astype(np.float64)
+            terms = (taken * x, taken**2 * x, taken**2 * x * x, float(taken**2))
+            self._moments = [total + term for total, term in zip(self._moments, terms, strict=True)]
+            self._sums = self._sums + raw
+            self.samples += taken
+            done += count
+            advance(done / self.total)
+            yield
+
+    def picture(self) -> Picture:
+        """The picture of the passes done."""
+        return _developed(self._film, self._sums)
+
+    def standard_error(self) -> Picture:
+        """The standard error of :meth:`picture`, from the scatter of the passes; NaN after the first."""
+        first, weighted, squares, weights = self._moments
+        mean = first / self.samples
+        passes = min(len(self._sizes), max(1, round(self.samples / self._sizes[0])))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            spread = (squares - 2.0 * mean * weighted + mean * mean * weights) / self.samples**2
+            error = np.sqrt(np.maximum(spread, 0.0) * passes / (passes - 1.0))
+        return Picture(error.astype(np.float32), self.picture().channels)
 
 
-def pass_sizes(spp: int, pixels: int) -> Iterator[int]:
-    """Samples per pixel of each pass: powers of two, so that all passes of one picture share a compiled kernel."""
-    most = max(1, min(spp // LEAST_PASSES, PASS_SAMPLES // pixels))
+def pass_sizes(spp: int, pixels: int, limit: int = PASS_SAMPLES) -> Iterator[int]:
+    """Samples per pixel of each pass: powers of two, so that all passes of one picture share a compiled kernel.
+
+    limit: camera samples of one pass.
+    """
+    most = max(1, min(spp // LEAST_PASSES, limit // pixels))
     size = 1 << (most.bit_length() - 1)
     if spp >= 4:
-        size = max(size, 4) if 4 * pixels <= PASS_SAMPLES else size
+        size = max(size, 4) if 4 * pixels <= limit else size
     while spp:
         while size > spp:
             size //= 2
