@@ -17,6 +17,7 @@ import click
 
 from . import __version__
 from .errors import InputError, LLVMError, one_line
+from .llvm import missing_library
 
 # Each is the click command named `command` of the module atmo_jit.commands.<name>, imported only when it is used.
 COMMANDS = {
@@ -74,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except LLVMError as error:
         return _fail(str(error), 1, settings)
     except Exception as error:
-        return _fail(f"{type(error).__name__}: {error} (atmo-jit --debug shows where)", 1, settings)
+        text = missing_library(error) or f"{type(error).__name__}: {error} (atmo-jit --debug shows where)"
+        return _fail(text, 1, settings)
 
 
 def _fail(text: str, status: int, settings: _Settings) -> int:

@@ -24,6 +24,7 @@ WHEEL = "karellen-llvm-core"
 OLDEST = 17
 
 _NAME = re.compile(r"libLLVM(?:-|\.so\.)(\d+)")
+_NOT_THERE = re.compile(r"(lib[^\s:/]+): cannot open shared object file")
 _drjit_came_first = False
 _configured: str | None = None
 _checked = False
@@ -80,12 +81,34 @@ def require_llvm() -> None:
 
 def examine() -> LLVM:
     """What Dr.Jit has loaded in this process. Imports Dr.Jit; compiles nothing."""
-    import drjit as dr
-
+    try:
+        import drjit as dr
+    except Exception as error:
+        found = missing_library(error)
+        if found is None:
+            raise
+        return LLVM(None, os.environ.get(VARIABLE) or None, _origin(), _drjit_came_first, found)
     loaded = dr.has_backend(dr.JitBackend.LLVM)
     version = ".".join(map(str, dr.detail.llvm_version())) if loaded else None
     path = _mapped_library()
     return LLVM(version, path, _origin(), _drjit_came_first, _remedy(version, path))
+
+
+def missing_library(error: BaseException | None) -> str | None:
+    """What to do about a failed import of Dr.Jit or Mitsuba that lacked a shared library, in one line; else None.
+
+    The binary wheels use libatomic, which comes with compilers and is not on minimal systems. Dr.Jit 1.5 fails while it
+    reports that (NameError), so the whole chain of exceptions counts.
+    """
+    while error is not None:
+        found = _NOT_THERE.match(str(error)) if isinstance(error, ImportError) else None
+        if found:
+            remedy = "from the system's packages"
+            if found[1].startswith("libatomic."):
+                remedy += " (Debian and Ubuntu: apt install libatomic1; Fedora: dnf install libatomic)"
+            return f"Dr.Jit cannot be imported: {found[1]} is not on this system; install it {remedy}"
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def examine_apart(timeout_s: float = 60.0) -> LLVM:

@@ -11,6 +11,7 @@ import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
 
+CLOUD = 3.0  # optical depth
 DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
 
 
@@ -53,6 +54,8 @@ class Resolution:
         """
         first = _degree(atmosphere, power=2.0, target=0.1 * tolerance)
         later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
+        if float(np.max(_depth(atmosphere))) > CLOUD:  # so many orders that no single one keeps its direction
+            first, later = min(first, 16), min(later, 8)
         fine = tolerance < 0.005
         return cls(
             altitudes=_altitudes(atmosphere, 16 if fine else 12),
@@ -76,7 +79,9 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
     for constituent in atmosphere.constituents:
         if constituent.phase is None:
             continue
-        share = -np.expm1(-3.0 * constituent.scattering_per_m * _column(atmosphere, constituent))
+        # How much of the light they meet these particles scatter.
+        depth = constituent.scattering_per_m * _column(atmosphere, constituent)
+        share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
         for wavelength in range(len(atmosphere.wavelengths_nm)):
             chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
             term = share[wavelength] * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
@@ -86,10 +91,15 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
 
 
 def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
-    """Node altitudes: more where the air is optically thick, in steps of four so that kernels are shared."""
-    depth = sum((c.extinction_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
-    extra = 8.0 * np.log2(1.0 + max(float(np.max(depth)) - 0.4, 0.0) / 2.0)
-    return min(clear + 4 * int(np.ceil(extra / 4.0)), 48)
+    """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
+    scattering = sum((c.scattering_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    extra = 8.0 * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
+    return min(clear + 4 * int(np.ceil(extra / 4.0)), 40)
+
+
+def _depth(atmosphere: Atmosphere) -> np.ndarray:
+    """Vertical optical depth [W]."""
+    return sum((c.extinction_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
 
 
 def _column(atmosphere: Atmosphere, constituent: Constituent) -> float:

@@ -2,6 +2,7 @@
 
     python -m bench.reference_medium sky --samples 100000            # all orders of scattering, 17 atmospheres
     python -m bench.reference_medium single --samples 100000         # single scattering and directly lit ground
+    python -m bench.reference_medium efficiency                      # 1 / (variance x CPU time) against `heterogeneous`
 
 Each line is one atmosphere: number of rays, rms of z = (difference) / (both standard errors), largest abs(z), and the bias: the mean
 relative difference, weighted by 1 / variance, with its standard error. Rays of which too few paths bring any light for their own
@@ -104,7 +105,7 @@ def line(a: Agreement) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("sky", "single"))
+    parser.add_argument("what", choices=("sky", "single", "efficiency"))
     parser.add_argument("--samples", type=int, default=100_000, help="paths for each ray and wavelength")
     parser.add_argument("--cases", type=int, nargs="*", help="indices of atmospheres (default: all 17)")
     parser.add_argument("--every", type=int, default=1, help="take every so-manyth ray")
@@ -113,10 +114,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     import mitsuba as mi
 
-    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb" if given.what == "efficiency" else "llvm_ad_mono")
     from atmo_jit.plugins import register
 
     register()
+    if given.what == "efficiency":
+        from .medium_efficiency import main as efficiency
+
+        return efficiency(given.json)
     rows = []
     for row in compare(given.samples, given.cases, single=given.what == "single", every=given.every):
         rows.append(row)

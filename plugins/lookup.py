@@ -14,9 +14,23 @@ import mitsuba as mi
 import numpy as np
 
 from .exposed import number
-from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, SUN_COLUMNS, SUN_ROWS, Disc, Panorama, Warp, mean_of_corners
+from .panorama import (
+    CELLS_AROUND,
+    CELLS_DOWN,
+    CELLS_UP,
+    COLUMNS,
+    ROWS_DOWN,
+    ROWS_UP,
+    SUN_COLUMNS,
+    SUN_ROWS,
+    Disc,
+    Panorama,
+    Warp,
+    cell_means,
+)
 
 ROWS = ROWS_DOWN + ROWS_UP
+CELLS = CELLS_DOWN + CELLS_UP
 # Importance of a cell: luminance times 1 at the zenith, falling to this at the horizon, which most surfaces see at a
 # worse angle. Surfaces that see the ground find it by sampling their BSDF, since it has no small bright features; it
 # gets a small share of the sky's samples at most. Both from the noise on planes of all slopes under ``path``.
@@ -102,22 +116,22 @@ class SkyLookup:
         u, down, up = place
         row = dr.select(
             a >= 0.0,
-            dr.minimum(dr.fma(up, ROWS_UP, ROWS_DOWN), ROWS - 0.01),
-            dr.clip(dr.fma(down, -ROWS_DOWN, ROWS_DOWN), 0.0, ROWS_DOWN - 0.01),
+            dr.minimum(dr.fma(up, CELLS_UP, CELLS_DOWN), CELLS - 0.01),
+            dr.clip(dr.fma(down, -CELLS_DOWN, CELLS_DOWN), 0.0, CELLS_DOWN - 0.01),
         )
-        column = dr.minimum(u * COLUMNS, COLUMNS - 0.01)
-        return self.density.eval(mi.Point2f(column / COLUMNS, row / ROWS), active)[0]
+        column = dr.minimum(u * CELLS_AROUND, CELLS_AROUND - 0.01)
+        return self.density.eval(mi.Point2f(column / CELLS_AROUND, row / CELLS), active)[0]
 
     def sample(self, sample: Any, active: Any) -> tuple[Any, Any]:
         """Sine of the elevation above the horizontal, and azimuth from the sun in [-pi, pi]: even within a cell."""
         row, up = self.row_steps.find(sample.y, 0.5, active)
-        column, along = self.column_steps.find(sample.x, (row + 0.5) / ROWS, active)
+        column, along = self.column_steps.find(sample.x, (row + 0.5) / CELLS, active)
         left = along < 0.5
         along = dr.select(left, dr.fma(-2.0, along, 1.0), dr.fma(2.0, along, -1.0))
         # The rows at the horizon stand twice among the nodes: cells above it begin one node later.
-        at = row + up + dr.select(row >= ROWS_DOWN, 1.5, 0.5)
-        phi = self.azimuths.eval((column + along + 0.5) / (COLUMNS + 1), active)[0]
-        return self.sines.eval(at / (ROWS + 2), active)[0], dr.select(left, -phi, phi)
+        at = row + up + dr.select(row >= CELLS_DOWN, 1.5, 0.5)
+        phi = self.azimuths.eval((column + along + 0.5) / (CELLS_AROUND + 1), active)[0]
+        return self.sines.eval(at / (CELLS + 2), active)[0], dr.select(left, -phi, phi)
 
 
 class Steps:
@@ -151,12 +165,12 @@ class Steps:
 
 def importance(view: Panorama, luminance: np.ndarray) -> tuple[np.ndarray, float]:
     """Sampling weights of the cells, and their sum, which competes with the sun in :func:`sun_share`."""
-    flux = mean_of_corners(np.maximum(luminance, 0.0)) * view.solid_angles()
-    sines = np.delete(0.5 * (view.cells()[0][1:] + view.cells()[0][:-1]), ROWS_DOWN)[:, None]
+    flux = cell_means(np.maximum(luminance, 0.0)) * view.solid_angles()
+    sines = np.delete(0.5 * (view.cells()[0][1:] + view.cells()[0][:-1]), CELLS_DOWN)[:, None]
     weight = flux * (HORIZON_IMPORTANCE + (1.0 - HORIZON_IMPORTANCE) * np.clip(sines, 0.0, 1.0))
-    above, below = weight[ROWS_DOWN:].sum(), weight[:ROWS_DOWN].sum()
+    above, below = weight[CELLS_DOWN:].sum(), weight[:CELLS_DOWN].sum()
     if above > 0.0 and below > GROUND_SHARE * above:
-        weight[:ROWS_DOWN] *= GROUND_SHARE * above / below
+        weight[:CELLS_DOWN] *= GROUND_SHARE * above / below
     return weight, float(weight.sum())
 
 

@@ -22,6 +22,9 @@ import numpy as np
 # random directions: see tests/plugins/test_panorama.py.
 ROWS_UP, ROWS_DOWN, COLUMNS = 128, 64, 72
 SUN_ROWS, SUN_COLUMNS = 49, 17
+# Sampling cells: this many along each side of the four nodes' cell, each of constant density.
+SPLIT = 2
+CELLS_UP, CELLS_DOWN, CELLS_AROUND = SPLIT * ROWS_UP, SPLIT * ROWS_DOWN, SPLIT * COLUMNS
 AUREOLE_RAD = math.radians(1.0)
 # A ray this close to the horizon is decided by rounding: the first rows stand this far off it.
 EDGE_RAD = 2e-6
@@ -135,19 +138,31 @@ class Panorama:
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:
         """Edges of the sampling cells: sine of elevation at the rows (the horizon twice), azimuth at the columns."""
-        return np.sin(self.rows() - self.dip), self.columns()
+        a = np.concatenate([-self.down.nodes(CELLS_DOWN + 1)[::-1], self.up.nodes(CELLS_UP + 1)])
+        return np.sin(a - self.dip), self.around.nodes(CELLS_AROUND + 1)
 
     def solid_angles(self) -> np.ndarray:
-        """Solid angle (sr) of the cells [ROWS_DOWN + ROWS_UP, COLUMNS], both sides of the sun's azimuth together."""
+        """Solid angle (sr) of the cells [CELLS_DOWN + CELLS_UP, CELLS_AROUND], both sides of the sun together."""
         sines, azimuths = self.cells()
-        heights = np.delete(np.diff(sines), ROWS_DOWN)
+        heights = np.delete(np.diff(sines), CELLS_DOWN)
         return 2.0 * heights[:, None] * np.diff(azimuths)[None, :]
 
 
-def mean_of_corners(values: np.ndarray) -> np.ndarray:
-    """Mean of a cell's four nodes: [rows, columns] -> [ROWS_DOWN + ROWS_UP, COLUMNS]; no cell spans the horizon."""
-    rows = np.delete(0.5 * (values[1:] + values[:-1]), ROWS_DOWN, axis=0)
-    return 0.5 * (rows[:, 1:] + rows[:, :-1])
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """Means over the sampling cells of values at the nodes, linear in between; no cell spans the horizon."""
+    parts = [
+        _means(_means(part, CELLS_DOWN if below else CELLS_UP).T, CELLS_AROUND).T
+        for below, part in ((True, values[: ROWS_DOWN + 1]), (False, values[ROWS_DOWN + 1 :]))
+    ]
+    return np.concatenate(parts)
+
+
+def _means(values: np.ndarray, count: int) -> np.ndarray:
+    """Means over ``count`` equal steps along the first axis, ``count`` being SPLIT times the number of intervals."""
+    at = (np.arange(count) + 0.5) / SPLIT
+    low = at.astype(int)
+    part = (at - low)[:, None]
+    return (1.0 - part) * values[low] + part * values[low + 1]
 
 
 def solve_sky(sky: Any, view: Panorama, sun_zenith: Any = None) -> list[Any]:

@@ -29,7 +29,7 @@ def trace(
     medium: Any,
     origin: np.ndarray,
     direction: np.ndarray,
-    time: np.ndarray,
+    time: np.ndarray | None,
     samples: int,
     *,
     seed: int = 0,
@@ -39,7 +39,7 @@ def trace(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean radiance, its standard error, and the number of samples that were not 0: [N, channels], [N, channels], [N].
 
-    origin, direction: [N, 3], scene units; time [N]; medium: the one that the rays start in; samples: of each ray, rounded up to
+    origin, direction: [N, 3], scene units; time [N], None for random ones from 0 to 1; medium: the one that the rays start in; samples: of each ray, rounded up to
     whole batches. For vectorised variants that are not polarised.
     """
     tracer = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": ROULETTE_DEPTH})
@@ -47,16 +47,18 @@ def trace(
     count = len(origin)
     each = max(1, min(samples, BATCH // count))
     batches = -(-samples // each)
-    start = [mi.Float(column.tolist()) for column in (*origin.T, *direction.T, time)]
+    start = [mi.Float(column.tolist()) for column in (*origin.T, *direction.T)]
+    at = None if time is None else mi.Float(time.tolist())
     total = squares = hits = 0.0
     for batch in range(batches):
         sampler.seed(seed * batches + batch, count * each)
         ray_index = dr.arange(mi.UInt32, count * each) // each
-        o, d, at = start[:3], start[3:6], start[6]
+        o, d = start[:3], start[3:]
         ray = dr.zeros(mi.RayDifferential3f, count * each)
         ray.o = mi.Point3f(*(dr.gather(mi.Float, c, ray_index) for c in o))
         ray.d = mi.Vector3f(*(dr.gather(mi.Float, c, ray_index) for c in d))
-        ray.time, ray.maxt = dr.gather(mi.Float, at, ray_index), dr.inf
+        ray.time = sampler.next_1d() if at is None else dr.gather(mi.Float, at, ray_index)
+        ray.maxt = dr.inf
         radiance = tracer.sample(scene, sampler, ray, medium)[0]
         values = np.stack([np.array(c, dtype=np.float64) for c in radiance], axis=-1).reshape(count, each, -1)
         total, squares = total + values.sum(axis=1), squares + (values**2).sum(axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import json
 import os
 import subprocess
@@ -147,3 +148,21 @@ def test_a_process_that_dies_is_survived(monkeypatch):
     assert state.version is None and "ended with status 1" in state.remedy
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     assert "did not start" in llvm.examine_apart().remedy
+
+
+def test_a_missing_system_library_is_named_behind_the_error_of_drjit_itself(monkeypatch):
+    def fails(name, *arguments, **options):
+        if name != "drjit":
+            return real(name, *arguments, **options)
+        try:
+            raise ImportError("libatomic.so.1: cannot open shared object file: No such file or directory")
+        except ImportError:
+            raise NameError("name '_drjit_ext' is not defined")  # noqa: B904 (as Dr.Jit 1.5 does)
+
+    real = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", fails)
+    state = llvm.examine()
+    assert state.version is None
+    assert state.remedy.startswith("Dr.Jit cannot be imported: libatomic.so.1 is not on this system; install it")
+    assert "apt install libatomic1" in state.remedy and "\n" not in state.remedy
+    assert llvm.missing_library(ImportError("no module named x")) is None

@@ -49,7 +49,11 @@ def test_the_readme_starts_with_two_complete_commands():
 
 def test_the_readmes_accuracy_is_what_was_measured():
     tables = [
-        [line for line in (ROOT / name).read_text(encoding="utf-8").splitlines() if line.startswith(("| single", "| all"))]
+        [
+            line
+            for line in (ROOT / name).read_text(encoding="utf-8").splitlines()
+            if line.startswith(("| single", "| all"))
+        ]
         for name in ("README.md", "docs/accuracy.md")
     ]
     assert len(tables[0]) == 5 and tables[0] == tables[1][:5]

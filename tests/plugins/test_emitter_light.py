@@ -130,14 +130,15 @@ def test_scales_remove_their_part(emitter) -> None:
 
 
 def test_units_are_those_of_sunsky(rgb: None, emitter) -> None:
-    # Clear air against sunsky's clearest (turbidity 2): the same sun within 15 %, a sky of the same size and hue.
+    # The preset's air is clearer than sunsky's at turbidity 2 (half the aerosol, so half the sky and a bluer sun):
+    # another unit or another white point would be off by more.
     common = {"sun_direction": sun(45.0), "albedo": 0.1}
     theirs = mi.load_dict({"type": "sunsky", "turbidity": 2.0, **common})
     d = np.array([sun(45.0), sun(60.0, 180.0), sun(30.0, 120.0), sun(80.0, 60.0)])
     ratio = seen(emitter(45.0), d) / seen(theirs, d)
-    print(ratio)
-    assert np.all(np.abs(ratio[0] - 1.0) < 0.25)
-    assert np.all((ratio[1:] > 0.4) & (ratio[1:] < 1.2))
+    assert ratio[0] @ LUMINANCE == pytest.approx(1.2, abs=0.1)
+    assert np.ptp(ratio, axis=1).max() < 0.25
+    assert np.all((ratio[1:] > 0.4) & (ratio[1:] < 0.8))
 
 
 def test_turning_the_frame_turns_the_light(rgb: None, emitter) -> None:
@@ -163,6 +164,7 @@ def test_sun_irradiance_does_not_depend_on_its_size(emitter) -> None:
     np.testing.assert_allclose(found[2], found[0], rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_particles_agree_with_paths(rgb: None) -> None:
     light = {"type": "atmosphere", "sun_direction": sun(50.0)}
     sphere = {

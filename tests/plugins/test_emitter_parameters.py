@@ -1,4 +1,4 @@
-"""Parameters of the emitter ``atmosphere``: those of sunsky, those of the atmosphere, what is exposed, what is refused."""
+"""Parameters of the emitter ``atmosphere``: those of sunsky and of the atmosphere, what is exposed, what is refused."""
 
 from __future__ import annotations
 
@@ -75,9 +75,10 @@ def test_atmosphere_by_name_file_and_text(rgb: None, tmp_path) -> None:
 
 
 def test_dotted_names(rgb: None) -> None:
-    direction = '<vector name="sun_direction" value="0.5, 0, 0.5"/>'
-    body = direction + '<float name="mie.phase.g" value="0.6"/><string name="mie.scattering_per_m" value="2e-5 2e-5,3e-5"/>'
-    xml = from_xml(body)
+    xml = from_xml(
+        '<vector name="sun_direction" value="0.5, 0, 0.5"/><float name="mie.phase.g" value="0.6"/>'
+        '<string name="mie.scattering_per_m" value="2e-5 2e-5,3e-5"/>'
+    )
     same = load(sun_direction=[0.5, 0, 0.5], mie_phase_g=0.6, mie_scattering_per_m="2e-5, 2e-5, 3e-5")
     np.testing.assert_array_equal(seen(xml, UP), seen(same, UP))
     vector = load(sun_direction=[0.5, 0, 0.5], mie_phase_g=0.6, mie_scattering_per_m=[2e-5, 2e-5, 3e-5])
@@ -202,7 +203,7 @@ def test_frozen_functions(rgb: None) -> None:
 
 REFUSED = [
     ({"turbidity": 3.0}, r"turbidity: found 3\.0; allowed: .*mie\.scattering_per_m = 1\.5e-04"),
-    ({"sun_direction": [0, 0, 1], "hour": 3.0}, "Both the 'sun_direction' and parameters for time/location were provided"),
+    ({"sun_direction": [0, 0, 1], "hour": 3.0}, "Both the 'sun_direction' and parameters for time/location were"),
     ({"sun_direction": [0, 0, 0]}, "sun_direction: found .* allowed: a vector"),
     ({"sun_direction": "up"}, "sun_direction: found 'up'; allowed: a vector"),
     ({"altitude": -1.0}, r"altitude: found -1\.0; allowed: a finite number >= 0"),

@@ -9,7 +9,8 @@ import pytest
 from atmo_jit.spectrum import SpectralBasis, cie_1931, interpolation_weights, solar_irradiance, xyz_to_srgb
 
 PRESET = np.array([680.0, 550.0, 440.0])
-# Mitsuba tabulates the colour matching functions at 5 nm, colour-science at 1 nm; their sRGB matrices have 6 and 4 digits.
+# Mitsuba tabulates the colour matching functions at 5 nm, colour-science at 1 nm; their sRGB matrices have 6 and 4
+# digits.
 MITSUBA = 1e-3
 
 

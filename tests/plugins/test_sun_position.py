@@ -45,4 +45,3 @@ def test_overhead_at_noon_on_the_tropic() -> None:
         for longitude in np.arange(-180.0, 180.0, 0.02)
     )
     assert np.degrees(lowest) < 0.02
-

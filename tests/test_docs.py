@@ -1,0 +1,46 @@
+"""The documentation names what is there: functions in docs/method.md, names in docs/glossary.md, links everywhere."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+METHOD, GLOSSARY = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("method.md", "glossary.md"))
+SOURCES = [*ROOT.glob("atmo_jit/**/*.py"), *ROOT.glob("plugins/*.py")]
+PAGES = [ROOT / "README.md", *ROOT.glob("docs/*.md")]
+
+
+def defined(nodes, names):
+    """Whether ``names``, a chain like Class.method, are defined or assigned in a module's or class's body."""
+    for node in nodes:
+        targets = [t.id for t in getattr(node, "targets", ()) if isinstance(t, ast.Name)]
+        if names[0] in (getattr(node, "name", None), *targets):
+            return len(names) == 1 or defined(node.body, names[1:])
+    return False
+
+
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"`([a-z_]+(?:\.[A-Za-z_]+)+)`", METHOD))))
+def test_functions_of_the_method_exist(name):
+    folder = "." if name.startswith("plugins.") else "atmo_jit"
+    parts = name.split(".")
+    count = 2 if folder == "." else 1
+    file = ROOT / folder / "/".join(parts[:count])
+    tree = ast.parse(file.with_suffix(".py").read_text(encoding="utf-8"))
+    assert defined(tree.body, parts[count:])
+
+
+def test_names_of_the_glossary_are_used():
+    words = set(re.findall(r"\w+", "".join(file.read_text(encoding="utf-8") for file in SOURCES)))
+    rows = [row.rsplit("|", 2)[1] for row in GLOSSARY.splitlines() if row.startswith("|")]
+    named = {word for cell in rows for code in re.findall(r"`([^`]+)`", cell) for word in re.findall(r"\w+", code)}
+    assert len(named) > 50 and not named - words
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
+    assert all((page.parent / link).is_file() for link in links)
