@@ -96,17 +96,14 @@ def measure(name: str, atmosphere: Atmosphere) -> dict[str, float]:
     each = parts.pop("air")
     center, radius = [0.0, 0.0, -atmosphere.bottom_radius_m], atmosphere.top_radius_m
     shared = mi.load_dict({"type": "atmosphere_medium", "atmosphere": json.dumps(atmosphere.to_dict())})
-    plain = {
-        "ground": {**parts["planet"], "radius": atmosphere.bottom_radius_m - 100.0},
-        "sun": {"type": "directional", "direction": [-np.sin(s), 0.0, -np.cos(s)], "irradiance": 1.0},
-    }
+    light = {"type": "directional", "direction": [-np.sin(s), 0.0, -np.cos(s)], "irradiance": 1.0}
     result: dict[str, Any] = {}
     means = {}
     for kind, medium in (("heterogeneous", stock(shared, center, radius)), ("same scene", shared), ("planet", each)):
         content = {"type": "scene", **parts}
         if medium is not each:
             top = {"type": "sphere", "center": center, "radius": radius, "bsdf": {"type": "null"}, "interior": medium}
-            content = {**content, "sun": plain["sun"], "top": top}
+            content |= {"sun": light, "top": top}
         scene = mi.load_dict(content)
         start = medium if altitude < atmosphere.thickness_m or medium is each else None
         arguments = (scene, start, origin, direction, None, SAMPLES)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import Any
 
 __all__ = ["PLUGINS", "register"]
 
@@ -33,7 +32,7 @@ def register() -> None:
 
     May be called any number of times, before or after a variant is set.
     """
-    import atmo_jit  # noqa: F401  (points Dr.Jit at a usable LLVM library before Mitsuba imports it)
+    import atmo_jit  # noqa: F401, I001  (first: it points Dr.Jit at a usable LLVM library before Mitsuba imports it)
     import mitsuba as mi
 
     mi.detail.add_variant_callback(_on_variant)
@@ -60,7 +59,7 @@ def plugin_class(name: str) -> type:
 
 @cache
 def _plugin_class(name: str, variant: str) -> type:
-    """Plugin classes inherit from the variant's own base class, so there is one per variant, made when it is first needed."""
+    """Plugin classes inherit from the variant's own base class: there is one per variant, made when first needed."""
     from .variants import bound
 
     _, base, module, description = PLUGINS[name]

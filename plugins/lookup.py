@@ -180,7 +180,6 @@ class SunLookup:
     def __init__(self, disc: Disc) -> None:
         self.low = number(disc.low)
         self.scale = number(1.0 / max(disc.high - disc.low, 1e-9))
-        self.risen = number(1.0 if disc.high > disc.low else 0.0)
         self.half_chord = number(math.sin(0.5 * disc.radius))
         self.inverse_chord2 = number(1.0 / (2.0 * math.sin(0.5 * disc.radius)) ** 2)
         self.density = number(1.0 / disc.solid_angle)

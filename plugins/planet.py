@@ -19,7 +19,8 @@ done about it:
 - A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of the planet would pass
   it 100 m lower.
 - Points of a sphere of the earth's size are known to 0.5 m, which is more than that offset at up to 16 km from the origin: the
-  ground would shadow itself. A mesh, whose points near the origin are exact, is the ground up to ``MESH_RADIUS_M``.
+  ground would shadow itself. Therefore it is a mesh, whose points near the origin are exact; its facets grow with the distance
+  and lie up to 1 km below the true ground at the other side of the planet. (It is also 1.4 times faster than a sphere.)
 """
 
 from __future__ import annotations
@@ -42,20 +43,18 @@ from .variants import bound
 from .wavelengths import Wavelengths
 
 SUNS = ("unit", "solar", "colour", "each")
-MESH_RADIUS_M = 1500e3
-SECTORS = 96
-STEP = 1.08  # ratio of the radii of neighbouring rings of vertices
+SECTORS = 256
+STEP = 1.03  # ratio of the radii of neighbouring rings of vertices
 GOLDEN = 0.6180339887  # the irrational number that is hardest to approximate
-SPHERE_DEPTH = 1e-4  # of the sphere that is the rest of the ground, in planet radii
 
 
 def ground_mesh(radius_m: float, altitude_m: float, scale: float, up: np.ndarray, bsdf: Any) -> Any:
-    """The ground around the scene's origin: rings of vertices below the planet's sphere, with its normals."""
-    reach = min(MESH_RADIUS_M, 0.25 * radius_m)
+    """The ground: rings of vertices around the scene's origin, below the planet's sphere, with its normals."""
+    reach = math.pi * radius_m
     rings = np.concatenate([[0.0], np.geomspace(1.0, reach, math.ceil(math.log(reach) / math.log(STEP)) + 1)])
     angle = rings / radius_m
     # Facets sink further below the sphere than their vertices; that does no harm.
-    depth = 1.01 * mi.math.RayEpsilon * (1.0 / scale + np.maximum(rings, altitude_m + rings * angle))
+    depth = 1.01 * mi.math.RayEpsilon * (1.0 / scale + altitude_m + np.minimum(rings, 2.0 * radius_m))
     # Embree lets rays through that meet an edge exactly: no edge or vertex lies in a plane or on a line that views are
     # likely to be in, and no two rings have edges in line.
     turn = 2.0 * math.pi * (np.arange(SECTORS) + GOLDEN * np.arange(len(rings))[:, None]) / SECTORS
@@ -126,7 +125,7 @@ def planet(
     sun_radius_deg: float = 0.0,
     channels: Sequence[int] | None = None,
 ) -> dict[str, Any]:
-    """The air (``air``), the ground (``ground``, ``planet``) and the sun (``sun``) for ``mi.load_dict``.
+    """The air (``air``), the ground (``ground``) and the sun (``sun``) for ``mi.load_dict``.
 
     atmosphere: anything that ``Atmosphere.load`` takes.
     sun_direction: towards the sun, in the scene; any length.
@@ -166,12 +165,6 @@ def planet(
     return {
         "air": air,
         "ground": ground_mesh(radius, altitude_m, scale, up_, bsdf),
-        "planet": {
-            "type": "sphere",
-            "center": center.tolist(),
-            "radius": radius * (1.0 - SPHERE_DEPTH) * scale,
-            "bsdf": bsdf,
-        },
         "sun": light,
     }
 

@@ -94,7 +94,6 @@ def planet_of(scene: Any) -> dict[str, Any]:
         sun="colour",
     )
     del parts["sun"]
-    parts["planet"] = mi.load_dict(parts["planet"])
     return parts
 
 
