@@ -189,6 +189,18 @@ def ground_light(optics: Optics, columns: SunColumns, rays: Rays, field: Field) 
 
 def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> list[Any]:
     """Irradiance of direct sunlight on a horizontal surface facing up at altitude ``h``, per channel."""
-    fraction = visible_sun(optics, h, optics.radius + h, mu_s) * dr.maximum(mu_s, 0.0)
+    cosine = disc_cosine(mu_s, optics.sun_radius)
     depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
-    return [solar * fraction * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
+    return [solar * cosine * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
+
+
+def disc_cosine(mu_s: Any, radius: Any) -> Any:
+    """Mean of max(mu, 0) over a disc of angular ``radius`` about mu_s: how much of a setting sun falls on a surface.
+
+    It is mu_s while the whole disc is up, 0 when it is all down; between, with x = mu_s / radius, the integral of
+    (x + t) 2 sqrt(1 - t^2) / pi over t from -x to 1, times the radius.
+    """
+    x = dr.clip(mu_s / dr.maximum(radius, 1e-7), -1.0, 1.0)
+    half = dr.safe_sqrt(1.0 - x * x)
+    part = x * (0.5 + (dr.asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
+    return dr.select(dr.abs(x) < 1.0, radius * dr.maximum(part, 0.0), dr.maximum(mu_s, 0.0))

@@ -20,7 +20,7 @@ done about it:
   it 100 m lower.
 - Points of a sphere of the earth's size are known to 0.5 m, which is more than that offset at up to 16 km from the origin: the
   ground would shadow itself. Therefore it is a mesh, whose points near the origin are exact; its facets grow with the distance
-  and lie up to 1 km below the true ground at the other side of the planet. (It is also 1.4 times faster than a sphere.)
+  and lie up to 1 km below the true ground at the other side of the planet. (It is also faster than a sphere.)
 """
 
 from __future__ import annotations

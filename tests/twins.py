@@ -232,8 +232,14 @@ class Twin:
         return out
 
     def sun_irradiance(self, h: ArrayLike, mu_s: ArrayLike) -> Array:
-        """Direct irradiance [N, W] on a horizontal surface facing up."""
-        return self.solar * self.sun_transmittance(h, mu_s) * np.maximum(np.atleast_1d(mu_s), 0.0)[:, None]
+        """Direct irradiance [N, W] on a horizontal surface facing up: the mean of max(mu, 0) over the sun's disc."""
+        h, mu_s = (np.atleast_1d(np.asarray(v, float)) for v in np.broadcast_arrays(h, mu_s))
+        mu = np.maximum(mu_s, self.disc_edges(h)[0])
+        through = np.exp(-self.optical_depth(self.columns(h, mu)))
+        ring, weight = np.polynomial.legendre.leggauss(400)
+        across = np.maximum(mu_s[:, None] + self.disc * ring, 0.0)
+        cosine = across @ (weight * np.sqrt(1.0 - ring**2)) * 2.0 / np.pi
+        return self.solar * through * (cosine if self.disc > 0 else np.maximum(mu_s, 0.0))[:, None]
 
     # --- single scattering ---
 

@@ -161,7 +161,8 @@ class Passes:
     """A picture in passes of different seeds, with the scene's integrator and first sensor.
 
     The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
-    estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all.
+    estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all;
+    ``seed``: of the first pass.
     """
 
     def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES) -> None:
@@ -171,7 +172,7 @@ class Passes:
         self._sizes = list(pass_sizes(self.total, int(np.prod(self._film.crop_size())), most))
         if len(self._sizes) == 1 and self.total > 1:  # one pass knows no standard error
             self._sizes = [self.total // 2, self.total - self.total // 2]
-        self.samples = 0
+        self.samples, self.seed = 0, 0
         self._sums: np.ndarray | float = 0.0
         # Of the passes' own pictures x with n samples each: sums of n x, n^2 x, n^2 x^2, n^2.
         self._moments: list[Any] = [0.0, 0.0, 0.0, 0.0]
@@ -181,7 +182,7 @@ class Passes:
         done = 0
         for seed, count in enumerate(self._sizes):
             integrator = self._scene.integrator()
-            integrator.render(self._scene, self._sensor, seed=seed, spp=count, develop=False, evaluate=True)
+            integrator.render(self._scene, self._sensor, seed=self.seed + seed, spp=count, develop=False, evaluate=True)
             raw = np.array(self._film.develop(raw=True), dtype=np.float64)
             taken = self._sampler.sample_count()
             x = _developed(self._film, raw).pixels.astype(np.float64)
