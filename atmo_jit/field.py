@@ -115,7 +115,8 @@ class Field:
             values = [packet(buffer, node + i, size, active) for i in (0, 1)]
             logs.append(
                 [
-                    dr.lerp(guide[0][c], guide[1][c], fs) + dr.log(dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30))
+                    dr.lerp(guide[0][c], guide[1][c], fs)
+                    + dr.log(dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30))
                     for c in channels
                 ]
             )

@@ -80,6 +80,7 @@ class Gather:
         samples, device, fine = self.samples, self.paths.device, self.grid.sun_refine
         suns, sources, azimuths, orders = self.grid.shape[1], self.grid.sources, self.azimuths, light.degree + 1
         contracted = self._contract(refine.altitudes(light.moments), light.sky, light.degree)
+        count = dr.opaque(t.UInt, orders, 1)
         per_visit = suns * azimuths
         lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
@@ -91,17 +92,20 @@ class Gather:
             s = dr.minimum(t.UInt(x), suns - 2)
             taps = _cubic(x - t.Float(s))
             # The table has one more sun before the first and after the last.
-            at = [(i * (suns + 2) + s + n) * orders for n in range(4)]
-            inner = [0.0] * channels
-            cos_m, cos_m1 = t.Float(1.0), cos_phi
-            for m in range(orders):
+            at = [dr.fma(dr.fma(i, suns + 2, s + n), count, 0) for n in range(4)]
+
+            def harmonic(m: Any, inner: list[Any], cos_m: Any, cos_m1: Any) -> tuple[Any, ...]:
                 corner = [packet(contracted, a + m, size) for a in at]
                 for c in range(channels):
                     value = taps[0] * corner[0][c]
                     for tap, values in zip(taps[1:], corner[1:], strict=True):
                         value = dr.fma(tap, values[c], value)
                     inner[c] = dr.fma(value, cos_m, inner[c])
-                cos_m, cos_m1 = dr.fma(2.0 * cos_phi, cos_m, -cos_m1), cos_m
+                return m + 1, inner, dr.fma(2.0 * cos_phi, cos_m, -cos_m1), cos_m
+
+            nothing = [0.0 * x for _ in range(channels)]
+            state = (t.UInt(0), nothing, 0.0 * x + 1.0, cos_phi + 0.0)
+            _, inner, _, _ = dr.while_loop(state, lambda m, *_: m < count, harmonic, label="harmonics")
             x = x * fine
             s = dr.minimum(t.UInt(x), sources - 2)
             f = x - t.Float(s)

@@ -130,7 +130,9 @@ class Grid:
         position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return _split(float(refine) * dr.lerp(u0, u1, position - t.Float(cell)), refine * (self.shape[0] - 1) + 1)
+        return _split(
+            parameter(float(refine)) * dr.lerp(u0, u1, position - t.Float(cell)), refine * (self.shape[0] - 1) + 1
+        )
 
     def sun_position(self, mu_s: Any) -> Any:
         """Sun coordinate x of cos(sun zenith) ``mu_s``, in units of the refined nodes, clipped to the last."""
@@ -153,7 +155,7 @@ def _rounded_depth(steps: np.ndarray) -> np.ndarray:
 
 def _split(position: Any, count: int) -> tuple[Any, Any]:
     t = types()
-    index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), count - 2)
+    index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), dr.opaque(t.UInt, count - 2, 1))
     return index, position - t.Float(index)
 
 

@@ -1,10 +1,11 @@
-"""Efficiency of ``atmosphere_medium`` beside Mitsuba's ``heterogeneous`` on the same scenes: 1 / (relative variance x CPU seconds).
+"""Efficiency of ``atmosphere_medium`` beside Mitsuba's ``heterogeneous`` on the same scenes: 1 / (relative variance x
+CPU seconds).
 
-``heterogeneous`` has one majorant for the whole planet: the extinction at the ground. It gets the same analytic densities through
-volumes that evaluate them (no grid of voxels resolves a planet), the same phase function, ground, sun and rays, so that only the
-medium's own sampling differs. Both are inside a null sphere at the top of the air and show three wavelengths that share their paths;
-the last column is the scene of ``plugins.planet``, without a sphere and with one wavelength for each path.
-"""
+``heterogeneous`` has one majorant for the whole planet: the extinction at the ground. It gets the same analytic
+densities through volumes that evaluate them (no grid of voxels resolves a planet), the same phase function, ground,
+sun and rays, so that only the medium's own sampling differs. Both are inside a null sphere at the top of the air and
+show three wavelengths that share their paths; the last column is the scene of ``plugins.planet``, without a sphere
+and with one wavelength for each path."""
 
 from __future__ import annotations
 
@@ -128,7 +129,10 @@ def main(as_json: bool) -> int:
             if not as_json:
                 gain, best = (row[kind] / row["heterogeneous"] for kind in ("same scene", "planet"))
                 z = max(value for key, value in row.items() if key.startswith("largest"))
-                print(f"{label:6s} {name:16s} gain {gain:5.2f}   scene of planet() {best:5.2f}   largest z {z:.1f}", flush=True)
+                print(
+                    f"{label:6s} {name:16s} gain {gain:5.2f}   scene of planet() {best:5.2f}   largest z {z:.1f}",
+                    flush=True,
+                )
     if as_json:
         print(json.dumps(rows))
     return 0

@@ -4,10 +4,10 @@
     python -m bench.reference_medium single --samples 100000         # single scattering and directly lit ground
     python -m bench.reference_medium efficiency                      # 1 / (variance x CPU time) against `heterogeneous`
 
-Each line is one atmosphere: number of rays, rms of z = (difference) / (both standard errors), largest abs(z), and the bias: the mean
-relative difference, weighted by 1 / variance, with its standard error. Rays of which too few paths bring any light for their own
-standard error to be known are left out and counted (a view of black ground from 1 m needs 10^6 paths for one).
-"""
+Each line is one atmosphere: number of rays, rms of z = (difference) / (both standard errors), largest abs(z), and the
+bias: the mean relative difference, weighted by 1 / variance, with its standard error. Rays of which too few paths
+bring any light for their own standard error to be known are left out and counted (a view of black ground from 1 m
+needs 10^6 paths for one)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ class Agreement:
     z: tuple[float, ...]
 
 
-def agreement(name: str, mean: np.ndarray, error: np.ndarray, truth: np.ndarray, sigma: np.ndarray, **facts) -> Agreement:
+def agreement(
+    name: str, mean: np.ndarray, error: np.ndarray, truth: np.ndarray, sigma: np.ndarray, **facts
+) -> Agreement:
     """Compare means [N] and their standard errors with the truth and its sigma; ``facts``: left_out, seconds."""
     both = np.hypot(error, sigma)
     z = (mean - truth) / both

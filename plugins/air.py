@@ -1,8 +1,9 @@
-"""The air of ``atmosphere_medium``: coefficients, densities and majorants at points of the scene, and which wavelength is whose.
+"""The air of ``atmosphere_medium``: coefficients, densities and majorants at points of the scene, and which
+wavelength is whose.
 
-The medium and its phase function share one :class:`Air`. Altitudes follow the package's rule of altitude first: positions are taken
-relative to the point of the ground below (or above) the scene's origin, where single precision resolves millimetres.
-"""
+The medium and its phase function share one :class:`Air`. Altitudes follow the package's rule of altitude first:
+positions are taken relative to the point of the ground below (or above) the scene's origin, where single precision
+resolves millimetres."""
 
 from __future__ import annotations
 
@@ -41,9 +42,8 @@ EXPOSED = (
 class Air:
     """Coefficients of an atmosphere in the scene.
 
-    ``center``: the planet's centre in scene units, float64 [3]; ``scale``: scene units per metre. Points, directions and distances
-    are in scene units; altitudes in metres; coefficients per metre.
-    """
+    ``center``: the planet's centre in scene units, float64 [3]; ``scale``: scene units per metre. Points, directions
+    and distances are in scene units; altitudes in metres; coefficients per metre."""
 
     def __init__(self, atmosphere: Atmosphere, center: np.ndarray, scale: float, wavelengths: Wavelengths) -> None:
         self.atmosphere, self.wavelengths, self.scale = atmosphere, wavelengths, scale
@@ -88,7 +88,9 @@ class Air:
         return excess / (dr.sqrt(excess + self.radius * self.radius) + self.radius)
 
     def along(self, ray: Any) -> tuple[Any, Any, Any, Any]:
-        """Of a ray: whether it meets the atmosphere, where (two distances >= 0), and its lowest altitude from there on (m, >= 0)."""
+        """Of a ray: whether it meets the atmosphere, where (two distances >= 0), and its lowest altitude from there
+        on (m, >= 0).
+        """
         q, z = self._relative(ray.o)
         h = self._altitude(q, z)
         d = ray.d
@@ -129,7 +131,9 @@ class Air:
         return c.profile
 
     def pick(self, interaction: Any) -> Callable[[str], Any]:
-        """The function that gives the value of a dotted name, as an unpolarised spectrum, at the interaction's wavelengths."""
+        """The function that gives the value of a dotted name, as an unpolarised spectrum, at the interaction's
+        wavelengths.
+        """
         chosen = self.wavelengths.choose(interaction)
 
         def value(name: str) -> Any:
@@ -159,7 +163,9 @@ class Air:
     # ---- majorants
 
     def _majorant_table(self) -> Any:
-        """Bounds [rows * MAJORANT_CELLS] of the extinction at and above each cell's altitudes, one row per choice of wavelength."""
+        """Bounds [rows * MAJORANT_CELLS] of the extinction at and above each cell's altitudes, one row per choice of
+        wavelength.
+        """
         edges = self.thickness * np.linspace(0.0, 1.0, MAJORANT_CELLS + 1) ** 2
         bound = 0.0
         for c in self.atmosphere.constituents:
@@ -170,11 +176,15 @@ class Air:
         return mi.Float(table.tolist()) if dr.is_jit_v(mi.Float) else table
 
     def majorant(self, lowest: Any, interaction: Any) -> Any:
-        """Bound of the extinction (1/m) at and above the altitude ``lowest`` (m), the same for all channels, detached."""
+        """Bound of the extinction (1/m) at and above the altitude ``lowest`` (m), the same for all channels,
+        detached.
+        """
         x = dr.sqrt(dr.detach(lowest) * (1.0 / self.thickness)) * MAJORANT_CELLS
         cell = dr.minimum(mi.UInt32(x), MAJORANT_CELLS - 1)
         index = cell + self.wavelengths.row(interaction) * MAJORANT_CELLS
-        return dr.gather(mi.Float, self.majorants, index) if dr.is_jit_v(mi.Float) else float(self.majorants[int(index)])
+        return (
+            dr.gather(mi.Float, self.majorants, index) if dr.is_jit_v(mi.Float) else float(self.majorants[int(index)])
+        )
 
 
 def largest(profile: Profile, edges: np.ndarray) -> np.ndarray:
@@ -195,4 +205,3 @@ def given(atmosphere: Atmosphere, name: str) -> Any:
     for key in name.split("."):
         node = node[int(key)] if isinstance(node, list) else node[key]
     return node
-

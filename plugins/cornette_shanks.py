@@ -15,44 +15,44 @@ from .exposed import array, single
 
 class CornetteShanksPhase:
     r"""
-.. _phase-cornette_shanks:
+    .. _phase-cornette_shanks:
 
-Cornette-Shanks phase function (:monosp:`cornette_shanks`)
-----------------------------------------------------------
+    Cornette-Shanks phase function (:monosp:`cornette_shanks`)
+    ----------------------------------------------------------
 
-.. pluginparameters::
+    .. pluginparameters::
 
- * - g
-   - |float|
-   - Asymmetry parameter in (-1, 1). (Default: 0.8)
-   - |exposed|, |differentiable|
+     * - g
+       - |float|
+       - Asymmetry parameter in (-1, 1). (Default: 0.8)
+       - |exposed|, |differentiable|
 
-Henyey and Greenstein's peak with the symmetry of Rayleigh scattering (Cornette and Shanks 1992):
+    Henyey and Greenstein's peak with the symmetry of Rayleigh scattering (Cornette and Shanks 1992):
 
-.. math::
+    .. math::
 
-    p(\nu) = \frac{3}{8 \pi} \frac{(1 - g^2) (1 + \nu^2)}{(2 + g^2) (1 + g^2 - 2 g \nu)^{3/2}}
+        p(\nu) = \frac{3}{8 \pi} \frac{(1 - g^2) (1 + \nu^2)}{(2 + g^2) (1 + g^2 - 2 g \nu)^{3/2}}
 
-with :math:`\nu` the cosine of the scattering angle, 1 = straight on. ``g`` = 0 is Rayleigh's phase function. The mean cosine is
-:math:`3 g (4 + g^2) / (5 (2 + g^2))`, not ``g``.
+    with :math:`\nu` the cosine of the scattering angle, 1 = straight on. ``g`` = 0 is Rayleigh's phase function. The mean
+    cosine is :math:`3 g (4 + g^2) / (5 (2 + g^2))`, not ``g``.
 
-Directions are drawn from Henyey and Greenstein's peak by exact inversion, so ``pdf`` is that density and the weight is the ratio
-:math:`3 (1 + \nu^2) / (2 (2 + g^2))`, between 0.5 and 1.5. (The inverse of this function's own cumulative distribution is
-the root of a quartic that loses its digits in single precision.)
+    Directions are drawn from Henyey and Greenstein's peak by exact inversion, so ``pdf`` is that density and the weight
+    is the ratio :math:`3 (1 + \nu^2) / (2 (2 + g^2))`, between 0.5 and 1.5. (The inverse of this function's own
+    cumulative distribution is the root of a quartic that loses its digits in single precision.)
 
-.. tabs::
-    .. code-tab:: xml
-        :name: cornette-shanks
+    .. tabs::
+        .. code-tab:: xml
+            :name: cornette-shanks
 
-        <phase type="cornette_shanks">
-            <float name="g" value="0.76"/>
-        </phase>
+            <phase type="cornette_shanks">
+                <float name="g" value="0.76"/>
+            </phase>
 
-    .. code-tab:: python
+        .. code-tab:: python
 
-        'type': 'cornette_shanks',
-        'g': 0.76
-"""
+            'type': 'cornette_shanks',
+            'g': 0.76
+    """
 
     def __init__(self, props: Any) -> None:
         mi.PhaseFunction.__init__(self, props)
@@ -68,7 +68,9 @@ the root of a quartic that loses its digits in single precision.)
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         if dr.is_jit_v(mi.Float):
-            dr.make_opaque(self._values)  # a literal would be compiled into the kernel, and another value need another one
+            dr.make_opaque(
+                self._values
+            )  # a literal would be compiled into the kernel, and another value need another one
 
     @property
     def _g(self) -> Any:

@@ -20,11 +20,91 @@ from .wavelengths import Wavelengths
 
 class AtmosphereMedium:
     """
-.. _medium-atmosphere_medium:
+    .. _medium-atmosphere_medium:
 
-The air of a planet (:monosp:`atmosphere_medium`)
--------------------------------------------------
-"""
+    The air of a planet (:monosp:`atmosphere_medium`)
+    -------------------------------------------------
+
+    .. pluginparameters::
+
+     * - atmosphere
+       - |string|
+       - The atmosphere: a preset (``earth``, ``bruneton2008``, ``hillaire2020``, ``mars``), the name of a JSON file, or
+         the JSON text itself. (Default: ``earth``)
+
+     * - *any value of the atmosphere* (``mie.phase.g``, ``rayleigh.scattering_per_m``, ``ozone.center_m``, ...)
+       - |float| or |string|
+       - Replaces the value of that dotted name, as for the emitter ``atmosphere``. Python dicts spell the dots as
+         underscores (``mie_phase_g``).
+       - |exposed|, |differentiable|
+
+     * - center
+       - |point|
+       - Centre of the planet in scene units. (Default: straight below the origin, which then is on the ground, +Z up)
+
+     * - scale
+       - |float|
+       - Scene units per metre. (Default: 1)
+
+     * - wavelength_rule
+       - |string|
+       - ``channels`` or ``time``, see below. (Default: ``channels``)
+
+     * - channels - |string| - Indices of the atmosphere's wavelengths that the channels of the variant show, such as ``0,
+       4, 9``. (Default: one for all if the atmosphere has one wavelength; the three of three in rgb variants; the one
+       nearest to 555 nm in mono)
+
+     * - sample_emitters
+       - |bool|
+       - As for other media. (Default: true)
+
+    The air between the ground and the top of the atmosphere, as a medium in which light is traced path by path: the
+    reference for everything that the package computes otherwise. Densities are evaluated, not stored in voxels; every
+    kind of profile and of phase function that an atmosphere file can hold is there. Below the ground and above the top
+    there is nothing, so a shape around it may be larger than the air. ``volpath``, ``volpathmis`` and ``prbvolpath``
+    render it.
+
+    **Wavelengths.** A picture shows radiance at wavelengths, not colours: with ``channels`` each channel of an rgb
+    variant is a wavelength of its own, and light sources are to be given in the same way. ``SpectralBasis.srgb_matrix``
+    makes colours of the picture afterwards. In spectral variants radiance is what the emitter ``atmosphere`` gives:
+    interpolated between the atmosphere's wavelengths. With ``time`` every path has the wavelength number floor(W * time)
+    of W; :py:func:`atmo_jit.plugins.planet.planet` uses this for scenes in the colours of the emitter, in every variant.
+
+    **Majorant.** A ray's majorant is the largest extinction at and above its lowest altitude from where it is, so it
+    falls while a path rises. It is the same for all wavelengths of a path.
+
+    **What to observe.** :py:func:`atmo_jit.plugins.planet.planet` places planet, air and sun so that all of this is taken
+        care of.
+
+    - The medium must end at a surface (a sphere with a ``null`` BSDF at the top) unless every path has one wavelength. -
+    Mitsuba starts rays 9e-5 of the largest coordinate beside the surface that they leave: put the origin near the camera.
+    - ``prbvolpath`` ignores the medium that a camera is in: put a small ``null`` sphere around the camera, with the
+    medium as its ``exterior``, and ``near_clip`` below its radius. - ``perspective`` sees no farther than ``far_clip``,
+    10 km by default, and the sky ends there. - ``max_depth`` counts every scattering: use -1 (1000 or so for
+    ``prbvolpath``), and ``rr_depth`` of some tens.
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: atmosphere-medium
+
+            <shape type="sphere">
+                <point name="center" x="0" y="0" z="-6360000"/>
+                <float name="radius" value="6420000"/>
+                <bsdf type="null"/>
+                <medium name="interior" type="atmosphere_medium">
+                    <string name="atmosphere" value="earth"/>
+                    <float name="mie.phase.g" value="0.76"/>
+                </medium>
+            </shape>
+
+        .. code-tab:: python
+
+            'type': 'sphere',
+            'center': [0, 0, -6360e3],
+            'radius': 6420e3,
+            'bsdf': {'type': 'null'},
+            'interior': {'type': 'atmosphere_medium', 'atmosphere': 'earth', 'mie_phase_g': 0.76}
+    """
 
     def __init__(self, props: Any) -> None:
         if any(isinstance(value, mi.PhaseFunction) for _, value in props.objects()):

@@ -1,4 +1,6 @@
-"""The phase function of ``atmosphere_medium``: that of its constituents, mixed per wavelength by what each scatters at that point."""
+"""The phase function of ``atmosphere_medium``: that of its constituents, mixed per wavelength by what each scatters
+at that point.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ PROPOSAL_FLOOR = 0.01
 class AirPhase:
     """sum_c s_c p_c(nu) / sum_c s_c with s_c the scattering coefficient of constituent c, per wavelength.
 
-    (A ``blendphase`` has one weight for all wavelengths, which is wrong by tens of percent.) Set ``air`` before use. Directions are
-    drawn from a mixture that is the same for all channels: constituent c with its share of the scattering, averaged over the channels.
-    """
+    (A ``blendphase`` has one weight for all wavelengths, which is wrong by tens of percent.) Set ``air`` before use.
+    Directions are drawn from a mixture that is the same for all channels: constituent c with its share of the
+    scattering, averaged over the channels."""
 
     def __init__(self, props: Any) -> None:
         mi.PhaseFunction.__init__(self, props)
@@ -66,7 +68,9 @@ class AirPhase:
         ]
 
     def _proposals(self, parts: list[tuple[Constituent, Any, Any]], total: Any) -> list[tuple[Any, Constituent, Any]]:
-        """Probability, constituent and g (a number) of every distribution of the mixture that directions are drawn from."""
+        """Probability, constituent and g (a number) of every distribution of the mixture that directions are drawn
+        from.
+        """
         result = []
         inverse = dr.detach(dr.select(total > 0.0, 1.0 / total, 0.0))
         for c, scattering, g in parts:

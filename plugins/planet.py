@@ -9,19 +9,18 @@
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "volpath", "max_depth": -1}, **earth,
                           "sensor": {"type": "fisheye", "medium": earth["air"]}})
 
-The scene's origin lies ``altitude_m`` above the ground, and z is up there. The medium knows where it ends, so no shape encloses
-it: the camera is in it, be it in the air or in space. What single precision does to a scene of this size, and what is
-done about it:
+The scene's origin lies ``altitude_m`` above the ground, and z is up there. The medium knows where it ends, so no
+shape encloses it: the camera is in it, be it in the air or in space. What single precision does to a scene of this
+size, and what is done about it:
 
-- Mitsuba starts a ray that leaves a surface 9e-5 of the largest coordinate above it: 0.1 mm beside the origin, 90 m at a
-  distance of 1000 km. In haze those 90 m are 1 % of what the ground reflects. Therefore the ground lies as much lower
-  as rays start higher, with nothing in between: the air begins at altitude 0 whatever the ground's own altitude is.
-- A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of the planet would pass
-  it 100 m lower.
-- Points of a sphere of the earth's size are known to 0.5 m, which is more than that offset at up to 16 km from the origin: the
-  ground would shadow itself. Therefore it is a mesh, whose points near the origin are exact; its facets grow with the distance
-  and lie up to 1 km below the true ground at the other side of the planet. (It is also faster than a sphere.)
-"""
+- Mitsuba starts a ray that leaves a surface 9e-5 of the largest coordinate above it: 0.1 mm beside the origin, 90 m
+at a distance of 1000 km. In haze those 90 m are 1 % of what the ground reflects. Therefore the ground lies as much
+lower as rays start higher, with nothing in between: the air begins at altitude 0 whatever the ground's own altitude
+is. - A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of
+the planet would pass it 100 m lower. - Points of a sphere of the earth's size are known to 0.5 m, which is more than
+that offset at up to 16 km from the origin: the ground would shadow itself. Therefore it is a mesh, whose points near
+the origin are exact; its facets grow with the distance and lie up to 1 km below the true ground at the other side of
+the planet. (It is also faster than a sphere.)"""
 
 from __future__ import annotations
 
@@ -92,7 +91,9 @@ def frame(up: np.ndarray) -> np.ndarray:
 def light_of(
     atmosphere: Atmosphere, sun: str, channels: Sequence[int] | None
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """The wavelengths in use, sunlight [C, U] that gives each of them its part of the picture, and the nm of C in spectral variants."""
+    """The wavelengths in use, sunlight [C, U] that gives each of them its part of the picture, and the nm of C in
+    spectral variants.
+    """
     irradiance = np.ones_like(atmosphere.solar_irradiance) if sun in ("unit", "each") else atmosphere.solar_irradiance
     basis = SpectralBasis.of(atmosphere)
     if sun == "each":
@@ -127,20 +128,16 @@ def planet(
 ) -> dict[str, Any]:
     """The air (``air``), the ground (``ground``) and the sun (``sun``) for ``mi.load_dict``.
 
-    atmosphere: anything that ``Atmosphere.load`` takes.
-    sun_direction: towards the sun, in the scene; any length.
-    altitude_m: of the scene's origin above the ground.
-    up: direction away from the planet's centre at the origin.
-    scale: scene units per metre.
-    sun: what light the sun gives. ``"unit"``: irradiance 1 in every channel, so that a picture is radiance in 1/sr, each channel at its
-        own wavelength (see ``channels`` of ``atmosphere_medium``). ``"solar"``: the same with the atmosphere's irradiance at that
-        wavelength. ``"colour"``: the colours of the emitter ``atmosphere``; then every path has one of the wavelengths, according to
-        its time. ``"each"``: irradiance 1 whatever the path's wavelength is, for those who choose the time of every ray
-        themselves. Except with ``"unit"`` and ``"solar"`` in mono variants, which have but one wavelength, the sensor
-        needs ``shutter_open`` 0 and ``shutter_close`` 1.
-    sun_radius_deg: angular radius of the sun's disc, 0 for parallel light.
-    channels: as for ``atmosphere_medium``.
-    """
+    atmosphere: anything that ``Atmosphere.load`` takes. sun_direction: towards the sun, in the scene; any length.
+    altitude_m: of the scene's origin above the ground. up: direction away from the planet's centre at the origin.
+    scale: scene units per metre. sun: what light the sun gives. ``"unit"``: irradiance 1 in every channel, so that a
+    picture is radiance in 1/sr, each channel at its own wavelength (see ``channels`` of ``atmosphere_medium``).
+    ``"solar"``: the same with the atmosphere's irradiance at that wavelength. ``"colour"``: the colours of the
+    emitter ``atmosphere``; then every path has one of the wavelengths, according to its time. ``"each"``: irradiance
+    1 whatever the path's wavelength is, for those who choose the time of every ray themselves. Except with ``"unit"``
+    and ``"solar"`` in mono variants, which have but one wavelength, the sensor needs ``shutter_open`` 0 and
+    ``shutter_close`` 1. sun_radius_deg: angular radius of the sun's disc, 0 for parallel light. channels: as for
+    ``atmosphere_medium``."""
     atmosphere = Atmosphere.load(atmosphere)
     if sun not in SUNS:
         raise AtmosphereError("sun", shown(sun), f"one of {', '.join(SUNS)}")

@@ -1,4 +1,5 @@
-"""Path-traced radiance of single rays, with its standard error: the form in which the reference is compared with numbers.
+"""Path-traced radiance of single rays, with its standard error: the form in which the reference is compared with
+numbers.
 
     mi.set_variant("llvm_ad_mono")
     sky = PathTracedSky("earth")
@@ -39,9 +40,8 @@ def trace(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean radiance, its standard error, and the number of samples that were not 0: [N, channels], [N, channels], [N].
 
-    origin, direction: [N, 3], scene units; time [N], None for random ones from 0 to 1; medium: the one that the rays start in; samples: of each ray, rounded up to
-    whole batches. For vectorised variants that are not polarised.
-    """
+    origin, direction: [N, 3], scene units; time [N], None for random ones from 0 to 1; medium: the one that the rays
+    start in; samples: of each ray, rounded up to whole batches. For vectorised variants that are not polarised."""
     tracer = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": ROULETTE_DEPTH})
     sampler = mi.load_dict({"type": "independent"})
     count = len(origin)
@@ -90,7 +90,11 @@ class PathTracedSky:
         results = [np.zeros(wavelength.shape) for _ in range(3)]
         for zenith in np.unique(view["sun_zenith_deg"]):
             rows = np.flatnonzero(view["sun_zenith_deg"] == zenith)
-            s, v, a = np.radians(zenith), np.radians(view["view_zenith_deg"][rows]), np.radians(view["azimuth_deg"][rows])
+            s, v, a = (
+                np.radians(zenith),
+                np.radians(view["view_zenith_deg"][rows]),
+                np.radians(view["azimuth_deg"][rows]),
+            )
             parts = planet(self.atmosphere, sun_direction=[np.sin(s), 0.0, np.cos(s)], sun="each")
             air = parts.pop("air")
             direction = np.stack([np.sin(v) * np.cos(a), np.sin(v) * np.sin(a), np.cos(v)], axis=-1)

@@ -1,12 +1,13 @@
 """Any scene with the emitter ``atmosphere``, with the path-traced air in its place.
 
-``edit`` changes what the parser read: the emitter becomes its own sun (plugin ``atmosphere_sun``), the integrator becomes
-``volpath`` without limit of depth, cameras see as far as there is air. ``planet_of`` gives what has to be added to the scene: air and
-ground, placed so that the scene's origin is at the emitter's ``altitude``. Everything else in the scene stays.
+``edit`` changes what the parser read: the emitter becomes its own sun (plugin ``atmosphere_sun``), the integrator
+becomes ``volpath`` without limit of depth, cameras see as far as there is air. ``planet_of`` gives what has to be
+added to the scene: air and ground, placed so that the scene's origin is at the emitter's ``altitude``. Everything
+else in the scene stays.
 
-What the picture then shows is what the emitter shows, except that air is also between the camera and the things in the scene, that
-light goes back and forth between those and the planet's own ground, and that the medium scatters the light of a sun with a disc.
-"""
+What the picture then shows is what the emitter shows, except that air is also between the camera and the things in
+the scene, that light goes back and forth between those and the planet's own ground, and that the medium scatters the
+light of a sun with a disc."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ ROULETTE_DEPTH = 32
 
 
 class AtmosphereSun(Sun):
-    """The sun of the emitter ``atmosphere``, from the same parameters: what is left of it where the air is path-traced."""
+    """The sun of the emitter ``atmosphere``, from the same parameters: what is left of it where the air is path-
+    traced.
+    """
 
     def __init__(self, props: Any) -> None:
         Sun.__init__(self, props)
@@ -69,7 +72,7 @@ def edit(state: Any) -> None:
                 raise InputError(f"--reference: the scene's integrator is {props.plugin_name()}; must be {allowed}")
             for name in list(props.keys()):
                 if name != "hide_emitters":
-                    props.remove_property(name)
+                    del props[name]
             props.set_plugin_name("volpath")
             props["max_depth"], props["rr_depth"] = -1, ROULETTE_DEPTH
         elif node.type == mi.ObjectType.Sensor:
@@ -104,7 +107,8 @@ def add(state: Any, parts: dict[str, Any]) -> None:
 
 
 def load_reference(load: Callable[[Callable[[Any], None]], Any]) -> Any:
-    """The scene with the path-traced air; ``load(edit)`` has to read and make it, calling ``edit`` with the parser's state.
+    """The scene with the path-traced air; ``load(edit)`` has to read and make it, calling ``edit`` with the parser's
+    state.
 
     It is called twice: what the air needs to know is known only after the emitter's parameters have been read.
     """

@@ -16,8 +16,9 @@ from . import settings
 
 
 class _Directions:
-    """What the two sensors share. ``_direction(u, v, proportion)`` gives the local direction of a place in the picture (u from left to
-    right and v from top to bottom, both 0 to 1; proportion = width / height), and whether the picture shows anything there."""
+    """What the two sensors share. ``_direction(u, v, proportion)`` gives the local direction of a place in the
+    picture (u from left to right and v from top to bottom, both 0 to 1; proportion = width / height), and whether the
+    picture shows anything there."""
 
     def __init__(self, props: Any) -> None:
         mi.Sensor.__init__(self, props)
@@ -64,46 +65,46 @@ class _Directions:
 
 class Fisheye(_Directions):
     """
-.. _sensor-fisheye:
+    .. _sensor-fisheye:
 
-Equidistant fisheye (:monosp:`fisheye`)
----------------------------------------
+    Equidistant fisheye (:monosp:`fisheye`)
+    ---------------------------------------
 
-.. pluginparameters::
+    .. pluginparameters::
 
- * - fov
-   - |float|
-   - Angle across the image circle in degrees, in (0, 360]. (Default: 180)
+     * - fov
+       - |float|
+       - Angle across the image circle in degrees, in (0, 360]. (Default: 180)
 
- * - to_world
-   - |transform|
-   - As for :monosp:`perspective`: the camera looks along its local +Z, with +Y up and +X to the left of the picture.
-   - |exposed|
+     * - to_world
+       - |transform|
+       - As for :monosp:`perspective`: the camera looks along its local +Z, with +Y up and +X to the left of the picture.
+       - |exposed|
 
-The distance of a pixel from the middle of the film is proportional to its angle from the optical axis. The image circle touches the
-shorter sides of the film; outside of it the film is black. Looking at the zenith with the top of the picture to the north, east is
-on the left, as in photographs of the sky.
+    The distance of a pixel from the middle of the film is proportional to its angle from the optical axis. The image
+    circle touches the shorter sides of the film; outside of it the film is black. Looking at the zenith with the top of
+    the picture to the north, east is on the left, as in photographs of the sky.
 
-.. tabs::
-    .. code-tab:: xml
-        :name: fisheye
+    .. tabs::
+        .. code-tab:: xml
+            :name: fisheye
 
-        <sensor type="fisheye">
-            <transform name="to_world">
-                <lookat origin="0, 0, 2" target="0, 0, 3" up="0, 1, 0"/>
-            </transform>
-            <film type="hdrfilm">
-                <integer name="width" value="256"/>
-                <integer name="height" value="256"/>
-            </film>
-        </sensor>
+            <sensor type="fisheye">
+                <transform name="to_world">
+                    <lookat origin="0, 0, 2" target="0, 0, 3" up="0, 1, 0"/>
+                </transform>
+                <film type="hdrfilm">
+                    <integer name="width" value="256"/>
+                    <integer name="height" value="256"/>
+                </film>
+            </sensor>
 
-    .. code-tab:: python
+        .. code-tab:: python
 
-        'type': 'fisheye',
-        'to_world': mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 3], up=[0, 1, 0]),
-        'film': {'type': 'hdrfilm', 'width': 256, 'height': 256}
-"""
+            'type': 'fisheye',
+            'to_world': mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 3], up=[0, 1, 0]),
+            'film': {'type': 'hdrfilm', 'width': 256, 'height': 256}
+    """
 
     def _setup(self, props: Any) -> None:
         fov = settings.number(props, "fov", 180.0)
@@ -122,41 +123,41 @@ on the left, as in photographs of the sky.
 
 class LatLong(_Directions):
     """
-.. _sensor-latlong:
+    .. _sensor-latlong:
 
-Latitude-longitude panorama (:monosp:`latlong`)
------------------------------------------------
+    Latitude-longitude panorama (:monosp:`latlong`)
+    -----------------------------------------------
 
-.. pluginparameters::
+    .. pluginparameters::
 
- * - to_world
-   - |transform|
-   - The local frame has +Z up; the middle of the picture looks along its +Y, and +X is to the right. (Default: none)
-   - |exposed|
+     * - to_world
+       - |transform|
+       - The local frame has +Z up; the middle of the picture looks along its +Y, and +X is to the right. (Default: none)
+       - |exposed|
 
-The whole sphere of directions: azimuth runs from left to right, the zenith is the top row and the nadir the bottom row, in equal
-steps of the zenith angle. A film twice as wide as high has square pixels at the horizon.
+    The whole sphere of directions: azimuth runs from left to right, the zenith is the top row and the nadir the bottom
+    row, in equal steps of the zenith angle. A film twice as wide as high has square pixels at the horizon.
 
-.. tabs::
-    .. code-tab:: xml
-        :name: latlong
+    .. tabs::
+        .. code-tab:: xml
+            :name: latlong
 
-        <sensor type="latlong">
-            <transform name="to_world">
-                <translate z="2"/>
-            </transform>
-            <film type="hdrfilm">
-                <integer name="width" value="512"/>
-                <integer name="height" value="256"/>
-            </film>
-        </sensor>
+            <sensor type="latlong">
+                <transform name="to_world">
+                    <translate z="2"/>
+                </transform>
+                <film type="hdrfilm">
+                    <integer name="width" value="512"/>
+                    <integer name="height" value="256"/>
+                </film>
+            </sensor>
 
-    .. code-tab:: python
+        .. code-tab:: python
 
-        'type': 'latlong',
-        'to_world': mi.ScalarTransform4f().translate([0, 0, 2]),
-        'film': {'type': 'hdrfilm', 'width': 512, 'height': 256}
-"""
+            'type': 'latlong',
+            'to_world': mi.ScalarTransform4f().translate([0, 0, 2]),
+            'film': {'type': 'hdrfilm', 'width': 512, 'height': 256}
+    """
 
     def _setup(self, props: Any) -> None:
         """There is nothing else to set."""

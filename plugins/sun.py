@@ -1,4 +1,6 @@
-"""Light and ground for the air of :mod:`.medium`: the sun at the top of the atmosphere, and reflectances per wavelength."""
+"""Light and ground for the air of :mod:`.medium`: the sun at the top of the atmosphere, and reflectances per
+wavelength.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ FAR = 1e10  # scene units: farther than any scene
 
 
 class PerWavelength:
-    """A texture with one value for each wavelength of an atmosphere, the same everywhere. ``use`` it before anything else."""
+    """A texture with one value for each wavelength of an atmosphere, the same everywhere. ``use`` it before anything
+    else.
+    """
 
     def __init__(self, props: Any) -> None:
         mi.Texture.__init__(self, props)
@@ -62,8 +66,8 @@ class PerWavelength:
 class Sun:
     """Parallel or nearly parallel light from far away. ``shine`` before anything else.
 
-    The disc is seen by whatever leaves the scene towards it; with radius 0 it is not seen and its light is exactly parallel.
-    """
+    The disc is seen by whatever leaves the scene towards it; with radius 0 it is not seen and its light is exactly
+    parallel."""
 
     def __init__(self, props: Any) -> None:
         mi.Emitter.__init__(self, props)
@@ -74,9 +78,8 @@ class Sun:
     ) -> None:
         """Set direction (towards the sun, unit vector), angular radius (degrees) and light.
 
-        colours: irradiance across the direction, [C, U]: for each of the wavelengths in use, the C channels of the variant; in spectral
-            variants the values at the C wavelengths ``nm``, which are equidistant.
-        """
+        colours: irradiance across the direction, [C, U]: for each of the wavelengths in use, the C channels of the
+        variant; in spectral variants the values at the C wavelengths ``nm``, which are equidistant."""
         self._parallel = radius_deg == 0.0
         shape = mi.EmitterFlags.DeltaDirection if self._parallel else mi.EmitterFlags.SpatiallyVarying
         self.m_flags = mi.EmitterFlags.Infinite | shape
@@ -98,7 +101,9 @@ class Sun:
         row = self._wavelengths.row(it)
         if not mi.is_spectral:
             jit = dr.is_jit_v(mi.Float)
-            return mi.UnpolarizedSpectrum(*(dr.gather(mi.Float, c, row) if jit else c[int(row)] for c in self._channels))
+            return mi.UnpolarizedSpectrum(
+                *(dr.gather(mi.Float, c, row) if jit else c[int(row)] for c in self._channels)
+            )
         result = mi.UnpolarizedSpectrum(0.0)
         for i in range(len(result)):
             at = (it.wavelengths[i] - self._first + 0.5 * self._step) / (self._step * self._count)

@@ -1,20 +1,19 @@
 """Which of an atmosphere's wavelengths a path of light has.
 
-Three rules, all of which leave a path with the atmosphere's own wavelengths only, so that nothing is invented in between:
+Three rules, all of which leave a path with the atmosphere's own wavelengths only, so that nothing is invented in
+between:
 
-- ``channels`` (rgb, mono): every channel of the variant is one wavelength. The channels share their paths.
-- ``turns`` (spectral): a wavelength of the variant stands for one of its two neighbours in the atmosphere, in turns that
-  are much shorter than any spectrum's structure. Their shares are the package's interpolation (linear in lambda^-4, see
-  :mod:`atmo_jit.spectrum`), so the mean over wavelengths is that of the interpolated radiance; with interpolated
-  coefficients it would not be.
-- ``time`` (all variants): every path has one wavelength, chosen by its time: number floor(time * U) of U, with a shutter
-  that is open from 0 to 1. The source of light has to be U times what that wavelength contributes to the picture, which
-  then is the sum over all.
+- ``channels`` (rgb, mono): every channel of the variant is one wavelength. The channels share their paths. -
+  ``turns`` (spectral): a wavelength of the variant stands for one of its two neighbours in the atmosphere, in turns
+  that are much shorter than any spectrum's structure. Their shares are the package's interpolation (linear in
+  lambda^-4, see :mod:`atmo_jit.spectrum`), so the mean over wavelengths is that of the interpolated radiance; with
+  interpolated coefficients it would not be. - ``time`` (all variants): every path has one wavelength, chosen by its
+  time: number floor(time * U) of U, with a shutter that is open from 0 to 1. The source of light has to be U times
+  what that wavelength contributes to the picture, which then is the sum over all.
 
-In the first two the coefficients of a path are chromatic. Mitsuba's integrators then weight paths with exp(-majorant *
-distance) over its own value, so a path must end at a surface, else the weight is 0/0: such a medium needs a boundary. With
-one wavelength for each path there is no such weight.
-"""
+In the first two the coefficients of a path are chromatic. Mitsuba's integrators then weight paths with exp(-majorant
+* distance) over its own value, so a path must end at a surface, else the weight is 0/0: such a medium needs a
+boundary. With one wavelength for each path there is no such weight."""
 
 from __future__ import annotations
 
@@ -33,12 +32,12 @@ TURNS_PER_NM = 64.0  # a float32 wavelength of 500 nm still resolves 500 steps i
 class Wavelengths:
     """The rule for an atmosphere's ``wavelengths_nm`` [W] in the current variant.
 
-    rule: "channels" (in spectral variants: turns) or "time".
-    channels: with "channels", index of the wavelength of every channel; None: one for all channels if W is 1, the three of
-        W = 3 in rgb, that nearest to 555 nm in mono. With "time", the indices of the wavelengths in use; None: all.
+    rule: "channels" (in spectral variants: turns) or "time". channels: with "channels", index of the wavelength of
+        every channel; None: one for all channels if W is 1, the three of W = 3 in rgb, that nearest to 555 nm in
+        mono. With "time", the indices of the wavelengths in use; None: all.
 
-    ``used``: the wavelengths in use. ``rows``: for every choice that :meth:`row` can give, the wavelengths of such a path.
-    """
+    ``used``: the wavelengths in use. ``rows``: for every choice that :meth:`row` can give, the wavelengths of such a
+    path."""
 
     def __init__(self, wavelengths_nm: np.ndarray, rule: str = "channels", channels: list[int] | None = None) -> None:
         if rule not in RULES:
@@ -114,7 +113,9 @@ class Wavelengths:
         return dr.gather(mi.UInt32, self.table, place) if dr.is_jit_v(mi.Float) else self.table[int(place)]
 
     def _in_turns(self, nm: Any) -> Any:
-        """The index that stands for ``nm`` (nm): that of the neighbour above where the fraction of the turn is below its share."""
+        """The index that stands for ``nm`` (nm): that of the neighbour above where the fraction of the turn is below
+        its share.
+        """
         x = dr.square(dr.square(100.0 / nm)) * 1e3
         place = mi.Float(0.0)
         for low, high in zip(self.knots, self.knots[1:], strict=False):

@@ -75,7 +75,9 @@ def render(scene: Any, passes: int, seed: int) -> np.ndarray:
 
 
 def assert_as_stored(name: str, integrator: str = "volpath", passes: int = PASSES) -> None:
-    """Render a picture and compare it with the stored one, which knows the variance of a pass better than a few passes do."""
+    """Render a picture and compare it with the stored one, which knows the variance of a pass better than a few
+    passes do.
+    """
     known = stored(name)
     mean = render(scene(name, integrator), passes, seed=0).mean(axis=0)
     assert_agree(known.with_mean(mean, passes / STORED_PASSES), known)

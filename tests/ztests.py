@@ -1,9 +1,9 @@
-"""Statistical tests of noisy pictures: Z-tests against a stored mean and variance, with a bound for all pixels together.
+"""Statistical tests of noisy pictures: Z-tests against a stored mean and variance, with a bound for all pixels
+together.
 
-A test that compares N noisy numbers must not fail by chance because N is large. With Sidak's correction each of the N two-sided
-Z-tests is made at the level 1 - (1 - alpha)^(1/N), so that all of them together fail with probability alpha if the picture is right.
-(Z. Sidak 1967, J. Am. Stat. Assoc. 62, 626; Mitsuba's own rendering tests do the same.)
-"""
+A test that compares N noisy numbers must not fail by chance because N is large. With Sidak's correction each of the N
+two-sided Z-tests is made at the level 1 - (1 - alpha)^(1/N), so that all of them together fail with probability alpha
+if the picture is right. (Z. Sidak 1967, J. Am. Stat. Assoc. 62, 626; Mitsuba's own rendering tests do the same.)"""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class Estimate:
         np.savez_compressed(path, mean=self.mean.astype(np.float32), variance=self.variance.astype(np.float32))
 
     def with_mean(self, mean: np.ndarray, share: float) -> Estimate:
-        """A new estimate of the same numbers from ``share`` times as many samples, with the variance that this one knows better."""
+        """A new estimate of the same numbers from ``share`` times as many samples, with the variance that this one
+        knows better.
+        """
         return Estimate(np.asarray(mean, dtype=np.float64), self.variance / share)
 
     @classmethod
@@ -61,9 +63,8 @@ def z_scores(one: Estimate, other: Estimate) -> np.ndarray:
 def assert_agree(one: Estimate, other: Estimate, alpha: float = ALPHA) -> None:
     """Raise AssertionError where two estimates differ by more than chance allows, anywhere or on the whole.
 
-    Two tests at half the level each: the largest of all abs(z), and the sum of z over the square root of their number, which
-    finds a bias that is too small to show in any single pixel.
-    """
+    Two tests at half the level each: the largest of all abs(z), and the sum of z over the square root of their
+    number, which finds a bias that is too small to show in any single pixel."""
     z = z_scores(one, other).ravel()
     worst = int(np.argmax(np.abs(z)))
     allowed = limit(len(z), alpha / 2.0)

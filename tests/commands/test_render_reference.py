@@ -29,7 +29,9 @@ def run(*arguments):
 
 
 def test_same_picture_as_the_emitter(tmp_path):
-    """Noon in a few large blocks, in units of the standard error plus 1 %: the air between camera and things is in one only."""
+    """Noon in a few large blocks, in units of the standard error plus 1 %: the air between camera and things is in
+    one only.
+    """
     paths = {name: tmp_path / f"{name}.exr" for name in ("paths", "tables")}
     assert run("noon", *SMALL, "--out", paths["paths"], "--spp", "1024", "--reference", "--standard-error") == 0
     assert run("noon", *SMALL, "--out", paths["tables"], "--spp", "1024") == 0

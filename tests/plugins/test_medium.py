@@ -210,7 +210,12 @@ def test_scene_of_ones_own_with_a_null_sphere(plugins, variant, integrator):
         "shutter_open": 0.0,
         "shutter_close": 1.0,
     }
-    ground = {"type": "sphere", "center": [0, 0, -RADIUS], "radius": RADIUS - 100.0, "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.1}}}
+    ground = {
+        "type": "sphere",
+        "center": [0, 0, -RADIUS],
+        "radius": RADIUS - 100.0,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.1}},
+    }
     own = {
         "type": "scene",
         "integrator": {"type": integrator, "max_depth": 1000, "rr_depth": 1000},
@@ -227,7 +232,9 @@ def test_scene_of_ones_own_with_a_null_sphere(plugins, variant, integrator):
     }
     found = np.mean([np.array(mi.render(mi.load_dict(own), spp=4096, seed=i)) for i in range(2)], axis=(0, 1, 2))
     volpath = {"type": "volpath", "max_depth": -1, "rr_depth": 1000}
-    scene = mi.load_dict({"type": "scene", "integrator": volpath, **parts, "sensor": {**sensor, "medium": parts["air"]}})
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": volpath, **parts, "sensor": {**sensor, "medium": parts["air"]}}
+    )
     truth = np.mean([np.array(mi.render(scene, spp=4096, seed=i)) for i in range(2)], axis=(0, 1, 2))
     np.testing.assert_allclose(found, truth, rtol=0.03)
 

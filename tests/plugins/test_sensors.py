@@ -90,6 +90,11 @@ def test_picture_of_a_constant_light(rgb):
     light = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 2, 3]}}
     for kind, mean in (("latlong", 1.0), ("fisheye", np.pi / 4)):
         film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}}
-        scene = {"type": "scene", "integrator": {"type": "path"}, "light": light, "sensor": {"type": kind, "film": film}}
+        scene = {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "light": light,
+            "sensor": {"type": kind, "film": film},
+        }
         picture = np.array(mi.render(mi.load_dict(scene), spp=64))
         np.testing.assert_allclose(picture.mean(axis=(0, 1)), mean * np.array([1, 2, 3]), rtol=5e-3)
