@@ -5,7 +5,8 @@ CPU seconds).
 densities through volumes that evaluate them (no grid of voxels resolves a planet), the same phase function, ground,
 sun and rays, so that only the medium's own sampling differs. Both are inside a null sphere at the top of the air and
 show three wavelengths that share their paths; the last column is the scene of ``plugins.planet``, without a sphere
-and with one wavelength for each path."""
+and with one wavelength for each path.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from atmo_jit.plugins.planet import planet
 from atmo_jit.plugins.rays import trace
 from atmo_jit.plugins.variants import bound
 
-SAMPLES = 2**17
+SAMPLES = 2**15
 # Scene: altitude of the camera (m), zenith angles of the views, zenith angle of the sun.
 SCENES = {
     "ground, sun 30": (2.0, (0, 30, 60, 80, 88), 30.0),

@@ -7,7 +7,8 @@
 Each line is one atmosphere: number of rays, rms of z = (difference) / (both standard errors), largest abs(z), and the
 bias: the mean relative difference, weighted by 1 / variance, with its standard error. Rays of which too few paths
 bring any light for their own standard error to be known are left out and counted (a view of black ground from 1 m
-needs 10^6 paths for one)."""
+needs 10^6 paths for one).
+"""
 
 from __future__ import annotations
 
@@ -101,7 +102,8 @@ def line(a: Agreement) -> str:
     """One line of the table."""
     return (
         f"{a.name:24s} {a.rays:3d} rays ({a.left_out} left out)  rms z {a.rms_z:.2f}  max {a.max_z:.1f}  "
-        f"bias {100 * a.bias:+.3f} +- {100 * a.bias_error:.3f} %  median error {100 * a.relative_error:.2f} %  {a.seconds:.1f} s"
+        f"bias {100 * a.bias:+.3f} +- {100 * a.bias_error:.3f} %  median error {100 * a.relative_error:.2f} %  "
+        f"{a.seconds:.1f} s"
     )
 
 

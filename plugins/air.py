@@ -3,7 +3,8 @@ wavelength is whose.
 
 The medium and its phase function share one :class:`Air`. Altitudes follow the package's rule of altitude first:
 positions are taken relative to the point of the ground below (or above) the scene's origin, where single precision
-resolves millimetres."""
+resolves millimetres.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +22,11 @@ from atmo_jit.profile import Exponential, Profile, Tent
 from .exposed import array, host
 from .wavelengths import Wavelengths
 
-# Cells of the majorant's table, spaced by the square root of altitude: 0.2 m at the ground of the earth, 230 m at its top.
+# Cells of the majorant's table, spaced by the square root of altitude: 0.2 m at the ground of the earth, 230 m at its
+# top.
 MAJORANT_CELLS = 512
-# The majorant is this much larger than the largest extinction, so that rounding of altitudes never turns null collisions negative.
+# The majorant is this much larger than the largest extinction, so that rounding of altitudes never turns null
+# collisions negative.
 MAJORANT_MARGIN = 1e-4
 # Of an altitude far from the planet, in float32: relative to (r^2 - R^2) / R.
 ROUNDING = 3e-7

@@ -33,8 +33,8 @@ class CornetteShanksPhase:
 
         p(\nu) = \frac{3}{8 \pi} \frac{(1 - g^2) (1 + \nu^2)}{(2 + g^2) (1 + g^2 - 2 g \nu)^{3/2}}
 
-    with :math:`\nu` the cosine of the scattering angle, 1 = straight on. ``g`` = 0 is Rayleigh's phase function. The mean
-    cosine is :math:`3 g (4 + g^2) / (5 (2 + g^2))`, not ``g``.
+    with :math:`\nu` the cosine of the scattering angle, 1 = straight on. ``g`` = 0 is Rayleigh's phase function.
+    The mean cosine is :math:`3 g (4 + g^2) / (5 (2 + g^2))`, not ``g``.
 
     Directions are drawn from Henyey and Greenstein's peak by exact inversion, so ``pdf`` is that density and the weight
     is the ratio :math:`3 (1 + \nu^2) / (2 (2 + g^2))`, between 0.5 and 1.5. (The inverse of this function's own
@@ -68,9 +68,8 @@ class CornetteShanksPhase:
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         if dr.is_jit_v(mi.Float):
-            dr.make_opaque(
-                self._values
-            )  # a literal would be compiled into the kernel, and another value need another one
+            # A literal would be compiled into the kernel, and another value need another one.
+            dr.make_opaque(self._values)
 
     @property
     def _g(self) -> Any:

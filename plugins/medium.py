@@ -50,9 +50,11 @@ class AtmosphereMedium:
        - |string|
        - ``channels`` or ``time``, see below. (Default: ``channels``)
 
-     * - channels - |string| - Indices of the atmosphere's wavelengths that the channels of the variant show, such as ``0,
-       4, 9``. (Default: one for all if the atmosphere has one wavelength; the three of three in rgb variants; the one
-       nearest to 555 nm in mono)
+     * - channels
+       - |string|
+       - Indices of the atmosphere's wavelengths that the channels of the variant show, such as ``0, 4, 9``.
+         (Default: one for all if the atmosphere has one wavelength; the three of three in rgb variants; the one nearest
+         to 555 nm in mono variants)
 
      * - sample_emitters
        - |bool|
@@ -65,23 +67,25 @@ class AtmosphereMedium:
     render it.
 
     **Wavelengths.** A picture shows radiance at wavelengths, not colours: with ``channels`` each channel of an rgb
-    variant is a wavelength of its own, and light sources are to be given in the same way. ``SpectralBasis.srgb_matrix``
-    makes colours of the picture afterwards. In spectral variants radiance is what the emitter ``atmosphere`` gives:
-    interpolated between the atmosphere's wavelengths. With ``time`` every path has the wavelength number floor(W * time)
-    of W; :py:func:`atmo_jit.plugins.planet.planet` uses this for scenes in the colours of the emitter, in every variant.
+    variant is a wavelength of its own, and light sources are to be given in the same way.
+    ``SpectralBasis.srgb_matrix`` makes colours of the picture afterwards. In spectral variants radiance is what the
+    emitter ``atmosphere`` gives: interpolated between the atmosphere's wavelengths. With ``time`` every path has
+    the wavelength number floor(W * time) of W; :py:func:`atmo_jit.plugins.planet.planet` uses this for scenes in
+    the colours of the emitter, in every variant.
 
     **Majorant.** A ray's majorant is the largest extinction at and above its lowest altitude from where it is, so it
     falls while a path rises. It is the same for all wavelengths of a path.
 
-    **What to observe.** :py:func:`atmo_jit.plugins.planet.planet` places planet, air and sun so that all of this is taken
-        care of.
+    **What to observe.** :py:func:`atmo_jit.plugins.planet.planet` places planet, air and sun so that all of this is
+    taken care of.
 
-    - The medium must end at a surface (a sphere with a ``null`` BSDF at the top) unless every path has one wavelength. -
-    Mitsuba starts rays 9e-5 of the largest coordinate beside the surface that they leave: put the origin near the camera.
+    - The medium must end at a surface (a sphere with a ``null`` BSDF at the top) unless every path has one wavelength.
+    - Mitsuba starts rays 9e-5 of the largest coordinate beside the surface that they leave: put the origin near the
+      camera.
     - ``prbvolpath`` ignores the medium that a camera is in: put a small ``null`` sphere around the camera, with the
-    medium as its ``exterior``, and ``near_clip`` below its radius. - ``perspective`` sees no farther than ``far_clip``,
-    10 km by default, and the sky ends there. - ``max_depth`` counts every scattering: use -1 (1000 or so for
-    ``prbvolpath``), and ``rr_depth`` of some tens.
+      medium as its ``exterior``, and ``near_clip`` below its radius.
+    - ``perspective`` sees no farther than ``far_clip``, 10 km by default, and the sky ends there.
+    - ``max_depth`` counts every scattering: use -1 (1000 or so for ``prbvolpath``), and ``rr_depth`` of some tens.
 
     .. tabs::
         .. code-tab:: xml

@@ -16,8 +16,8 @@ from atmo_jit.phase import CornetteShanks, HenyeyGreenstein, Isotropic, Rayleigh
 from .air import Air
 from .cornette_shanks import density, direction, henyey_greenstein_cosine, rayleigh_cosine
 
-# Directions of tabulated and Legendre phase functions are drawn from samples of them at this many cosines, and no less than this share
-# of their mean, so that weights stay bounded where a truncated series dips below 0.
+# Directions of tabulated and Legendre phase functions are drawn from samples of them at this many cosines, and no less
+# than this share of their mean, so that weights stay bounded where a truncated series dips below 0.
 PROPOSAL_NODES = 513
 PROPOSAL_FLOOR = 0.01
 

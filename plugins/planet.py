@@ -13,14 +13,15 @@ The scene's origin lies ``altitude_m`` above the ground, and z is up there. The 
 shape encloses it: the camera is in it, be it in the air or in space. What single precision does to a scene of this
 size, and what is done about it:
 
-- Mitsuba starts a ray that leaves a surface 9e-5 of the largest coordinate above it: 0.1 mm beside the origin, 90 m
-at a distance of 1000 km. In haze those 90 m are 1 % of what the ground reflects. Therefore the ground lies as much
-lower as rays start higher, with nothing in between: the air begins at altitude 0 whatever the ground's own altitude
-is. - A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of
-the planet would pass it 100 m lower. - Points of a sphere of the earth's size are known to 0.5 m, which is more than
-that offset at up to 16 km from the origin: the ground would shadow itself. Therefore it is a mesh, whose points near
-the origin are exact; its facets grow with the distance and lie up to 1 km below the true ground at the other side of
-the planet. (It is also faster than a sphere.)"""
+- Mitsuba starts a ray that leaves a surface 9e-5 of the largest coordinate above it: 0.1 mm beside the origin, 90 m at
+  a distance of 1000 km. In haze those 90 m are 1 % of what the ground reflects. Therefore the ground lies as much lower
+  as rays start higher, with nothing in between: the air begins at altitude 0 whatever the ground's own altitude is.
+- A shape that encloses the air would shift rays in the same way where they enter it; rays that pass the limb of the
+  planet would pass it 100 m lower.
+- Points of a sphere of the earth's size are known to 0.5 m, which is more than that offset at up to 16 km from the
+  origin: the ground would shadow itself. Therefore it is a mesh, whose points near the origin are exact; its facets
+  grow with the distance and lie up to 2 km below the true ground at the other side of the planet. (It is also faster.)
+"""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def trace(
 
 
 class PathTracedSky:
-    """Radiance for a list of views, as ``atmo_jit.sky`` takes them, for sunlight of irradiance 1 at every wavelength."""
+    """Radiance of a list of views, as ``atmo_jit.sky`` takes them, in sunlight of irradiance 1 at every wavelength."""
 
     def __init__(self, atmosphere: Any) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)

@@ -7,7 +7,8 @@ else in the scene stays.
 
 What the picture then shows is what the emitter shows, except that air is also between the camera and the things in
 the scene, that light goes back and forth between those and the planet's own ground, and that the medium scatters the
-light of a sun with a disc."""
+light of a sun with a disc.
+"""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Fisheye(_Directions):
 
      * - to_world
        - |transform|
-       - As for :monosp:`perspective`: the camera looks along its local +Z, with +Y up and +X to the left of the picture.
+       - As for :monosp:`perspective`: the camera looks along its local +Z, with +Y up and +X to the left.
        - |exposed|
 
     The distance of a pixel from the middle of the film is proportional to its angle from the optical axis. The image
@@ -132,7 +132,7 @@ class LatLong(_Directions):
 
      * - to_world
        - |transform|
-       - The local frame has +Z up; the middle of the picture looks along its +Y, and +X is to the right. (Default: none)
+       - The local frame has +Z up; the middle of the picture looks along its +Y, and +X is to the right.
        - |exposed|
 
     The whole sphere of directions: azimuth runs from left to right, the zenith is the top row and the nadir the bottom

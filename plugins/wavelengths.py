@@ -3,17 +3,19 @@
 Three rules, all of which leave a path with the atmosphere's own wavelengths only, so that nothing is invented in
 between:
 
-- ``channels`` (rgb, mono): every channel of the variant is one wavelength. The channels share their paths. -
-  ``turns`` (spectral): a wavelength of the variant stands for one of its two neighbours in the atmosphere, in turns
+- ``channels`` (rgb, mono): every channel of the variant is one wavelength. The channels share their paths.
+- ``turns`` (spectral): a wavelength of the variant stands for one of its two neighbours in the atmosphere, in turns
   that are much shorter than any spectrum's structure. Their shares are the package's interpolation (linear in
   lambda^-4, see :mod:`atmo_jit.spectrum`), so the mean over wavelengths is that of the interpolated radiance; with
-  interpolated coefficients it would not be. - ``time`` (all variants): every path has one wavelength, chosen by its
-  time: number floor(time * U) of U, with a shutter that is open from 0 to 1. The source of light has to be U times
-  what that wavelength contributes to the picture, which then is the sum over all.
+  interpolated coefficients it would not be.
+- ``time`` (all variants): every path has one wavelength, chosen by its time: number floor(time * U) of U, with a
+  shutter that is open from 0 to 1. The source of light has to be U times what that wavelength contributes to the
+  picture, which then is the sum over all.
 
-In the first two the coefficients of a path are chromatic. Mitsuba's integrators then weight paths with exp(-majorant
-* distance) over its own value, so a path must end at a surface, else the weight is 0/0: such a medium needs a
-boundary. With one wavelength for each path there is no such weight."""
+In the first two the coefficients of a path are chromatic. Mitsuba's integrators then weight paths with exp(-majorant *
+distance) over its own value, so a path must end at a surface, else the weight is 0/0: such a medium needs a boundary.
+With one wavelength for each path there is no such weight.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@ together.
 
 A test that compares N noisy numbers must not fail by chance because N is large. With Sidak's correction each of the N
 two-sided Z-tests is made at the level 1 - (1 - alpha)^(1/N), so that all of them together fail with probability alpha
-if the picture is right. (Z. Sidak 1967, J. Am. Stat. Assoc. 62, 626; Mitsuba's own rendering tests do the same.)"""
+if the picture is right. (Z. Sidak 1967, J. Am. Stat. Assoc. 62, 626; Mitsuba's own rendering tests do the same.)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The medium ``atmosphere_medium``: coefficients, majorants, wavelengths, parameters, and radiance against the reference."""
+"""The medium ``atmosphere_medium``: coefficients, majorants, wavelengths, parameters, and radiance."""
 
 from __future__ import annotations
 
@@ -272,3 +272,22 @@ def test_single_scattering_agrees_with_quadrature(plugins, reference):
     mi.set_variant("llvm_ad_mono")
     for row in compare(50_000, single=True):
         assert abs(row.bias) < 0.001 + 3 * row.bias_error, row.name
+
+
+def test_derivatives_by_path_replay(plugins, reference):
+    """Two rays with large derivatives; all of them: ``python -m bench.medium_derivatives``."""
+    from bench.medium_derivatives import compare
+
+    mi.set_variant("llvm_ad_mono")
+    for _, difference, sigma in compare(2**18, [0, 14]):
+        assert np.all(np.abs(difference) < 0.02 + 4 * sigma)
+        assert np.all(sigma < 0.3)
+
+
+@pytest.mark.slow
+def test_all_derivatives_by_path_replay(plugins, reference):
+    from bench.medium_derivatives import compare
+
+    mi.set_variant("llvm_ad_mono")
+    for row, difference, sigma in compare(2**20):
+        assert np.all(np.abs(difference) < 0.02 + 4 * sigma), row
