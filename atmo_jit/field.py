@@ -88,11 +88,15 @@ class Field:
             dr.arange(t.UInt, altitudes),
             size,
         )
-        lane = dr.arange(t.UInt, altitudes * suns * size)
-        below_top = dr.select(lane >= (altitudes - 1) * suns * size, lane - suns * size, lane)
-        return dr.gather(t.Float, irradiance, below_top) * dr.gather(
-            t.Float, per_altitude, below_top // (suns * size) * size + lane % size
-        )
+        row = suns * size
+        lane = dr.arange(t.UInt, altitudes * row)
+        quotient = irradiance * dr.gather(t.Float, per_altitude, lane // row * size + lane % size)
+        dr.eval(quotient)
+        # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
+        end = altitudes * row - row + lane % row
+        near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * row), 1e-30) for n in (1, 2))
+        steady = near * dr.clip(near / far, 0.25, 4.0)
+        return dr.select(lane >= (altitudes - 1) * row, steady, quotient)
 
     def _depth_above(self, h: Any) -> list[Any]:
         return self.optics.scattering_depths(self.columns.upward(h))
