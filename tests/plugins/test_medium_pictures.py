@@ -20,4 +20,5 @@ def test_both_integrators_agree(rgb):
 @pytest.mark.slow
 def test_scalar_variant_agrees(plugins):
     mi.set_variant("scalar_rgb")
-    assert_as_stored("earth_ground_sun30", passes=1)
+    # One pass of 64 samples has tails that a normal distribution lacks; the mean of six has lost them.
+    assert_as_stored("earth_ground_sun30", passes=6)
