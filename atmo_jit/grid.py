@@ -17,7 +17,7 @@ import numpy as np
 
 from .atmosphere import Atmosphere
 from .backend import floats, parameter, types
-from .plan import Resolution
+from .resolution import Resolution
 
 _FINE = 2048
 REMEMBERED = 8  # grids kept with all that was built on them

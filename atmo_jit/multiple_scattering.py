@@ -18,9 +18,9 @@ from .gather import Gather
 from .grid import Grid
 from .optics import Optics
 from .paths import directions_at
-from .plan import Resolution
 from .projection import projection
 from .refinement import Order, Refinement, combined
+from .resolution import Resolution
 from .single_scattering import first_order
 
 

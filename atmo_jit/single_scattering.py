@@ -16,8 +16,8 @@ from .march import Rays, point_along, visible_sun
 from .optics import PHASE_NODES, Optics
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
-from .plan import Resolution
 from .quadrature import cosine_interpolation, half_circle
+from .resolution import Resolution
 
 
 class Sunbeam:

@@ -26,7 +26,7 @@ from .grid import Grid
 from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve
 from .optics import MAX_CHANNELS, Optics
-from .plan import Resolution
+from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views
 

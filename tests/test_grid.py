@@ -6,7 +6,7 @@ import pytest
 import atmo_jit
 from atmo_jit.backend import floats
 from atmo_jit.grid import Grid
-from atmo_jit.plan import Resolution
+from atmo_jit.resolution import Resolution
 
 EARTH = atmo_jit.Atmosphere.load("earth")
 

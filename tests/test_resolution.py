@@ -1,7 +1,7 @@
 """What an atmosphere needs."""
 
 import atmo_jit
-from atmo_jit.plan import DEGREES, Resolution
+from atmo_jit.resolution import DEGREES, Resolution
 
 EARTH = atmo_jit.Atmosphere.load("earth")
 
