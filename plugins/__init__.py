@@ -20,6 +20,7 @@ __all__ = ["PLUGINS", "register"]
 PLUGINS = {
     "atmosphere": ("emitter", "Emitter", "emitter", "AtmosphereEmitter"),
     "atmosphere_sun": ("emitter", "Emitter", "reference", "AtmosphereSun"),
+    "atmosphere_volpath": ("integrator", "SamplingIntegrator", "volpath", "AtmosphereVolpath"),
     "atmosphere_medium": ("medium", "Medium", "medium", "AtmosphereMedium"),
     "cornette_shanks": ("phase", "PhaseFunction", "cornette_shanks", "CornetteShanksPhase"),
     "fisheye": ("sensor", "Sensor", "sensors", "Fisheye"),

@@ -126,6 +126,7 @@ def planet(
     sun: str = "unit",
     sun_radius_deg: float = 0.0,
     channels: Sequence[int] | None = None,
+    wavelength_rule: str = "time",
 ) -> dict[str, Any]:
     """The air (``air``), the ground (``ground``) and the sun (``sun``) for ``mi.load_dict``.
 
@@ -138,10 +139,15 @@ def planet(
     1 whatever the path's wavelength is, for those who choose the time of every ray themselves. Except with ``"unit"``
     and ``"solar"`` in mono variants, which have but one wavelength, the sensor needs ``shutter_open`` 0 and
     ``shutter_close`` 1. sun_radius_deg: angular radius of the sun's disc, 0 for parallel light. channels: as for
-    ``atmosphere_medium``."""
+    ``atmosphere_medium``. wavelength_rule: ``"time"``, or ``"channels"`` with the suns ``"unit"`` and ``"solar"`` in
+    rgb and mono variants: then the channels share their paths, for ``atmosphere_volpath``, which needs no boundary for
+    that."""
     atmosphere = Atmosphere.load(atmosphere)
     if sun not in SUNS:
         raise AtmosphereError("sun", shown(sun), f"one of {', '.join(SUNS)}")
+    shared = wavelength_rule == "channels"
+    if shared and (mi.is_spectral or sun not in ("unit", "solar")):
+        raise AtmosphereError("wavelength_rule", "'channels'", "'time' here: only suns unit and solar in rgb and mono")
     up_, to_sun = (np.array(v, dtype=np.float64) for v in (up, sun_direction))
     up_, to_sun = up_ / np.linalg.norm(up_), to_sun / np.linalg.norm(to_sun)
     radius = atmosphere.bottom_radius_m
@@ -149,8 +155,12 @@ def planet(
     props = mi.Properties("atmosphere_medium")
     props["atmosphere"] = json.dumps(atmosphere.to_dict())
     props["center"], props["scale"] = mi.ScalarPoint3f(center), scale
-    props["wavelength_rule"] = "time"
+    props["wavelength_rule"] = wavelength_rule
     selected, colours, nm = light_of(atmosphere, sun, channels)
+    if shared:
+        selected = Wavelengths(atmosphere.wavelengths_nm, "channels", channels and list(channels)).channels
+        # One row for all paths, each channel its own part.
+        colours = colours.sum(axis=1, keepdims=True) / len(set(selected))
     props["channels"] = ", ".join(map(str, selected))
     air = plugin_class("atmosphere_medium")(props)
     wavelengths = air.air.wavelengths

@@ -42,7 +42,9 @@ def trace(
 
     origin, direction: [N, 3], scene units; time [N], None for random ones from 0 to 1; medium: the one that the rays
     start in; samples: of each ray, rounded up to whole batches. For vectorised variants that are not polarised."""
-    tracer = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": ROULETTE_DEPTH})
+    # The stock integrators' roulette does not know that a bounce in the air loses little.
+    depth = {} if integrator == "atmosphere_volpath" else {"rr_depth": ROULETTE_DEPTH}
+    tracer = mi.load_dict({"type": integrator, "max_depth": max_depth, **depth})
     sampler = mi.load_dict({"type": "independent"})
     count = len(origin)
     each = max(1, min(samples, BATCH // count))
@@ -60,6 +62,7 @@ def trace(
         ray.time = sampler.next_1d() if at is None else dr.gather(mi.Float, at, ray_index)
         ray.maxt = dr.inf
         radiance = tracer.sample(scene, sampler, ray, medium)[0]
+        dr.eval(radiance)  # all channels in one kernel
         values = np.stack([np.array(c, dtype=np.float64) for c in radiance], axis=-1).reshape(count, each, -1)
         total, squares = total + values.sum(axis=1), squares + (values**2).sum(axis=1)
         hits = hits + (values != 0.0).any(axis=-1).sum(axis=1)
