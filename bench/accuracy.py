@@ -247,10 +247,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bench.accuracy: {error}", file=sys.stderr)
         return 2
     from .page import accuracy_page
+    from .path_tables import section_of
 
     result = measure(path=options.reference)
     text = accuracy_page(result)
     if options.out:
+        # What another command has written into the page stays.
+        text = text.rstrip("\n") + "\n\n" + section_of(options.out)
         options.out.parent.mkdir(parents=True, exist_ok=True)
         partial = options.out.with_name(options.out.name + ".partial")
         partial.write_text(text, encoding="utf-8")

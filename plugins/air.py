@@ -19,6 +19,7 @@ from atmo_jit.atmosphere import Atmosphere, Constituent
 from atmo_jit.phase import CornetteShanks, HenyeyGreenstein
 from atmo_jit.profile import Exponential, Profile, Tent
 
+from .cornette_shanks import density
 from .exposed import array, host
 from .wavelengths import Wavelengths
 
@@ -162,6 +163,14 @@ class Air:
         """g of a constituent's phase function, None where it has none."""
         has = isinstance(c.phase, (CornetteShanks, HenyeyGreenstein))
         return value(f"{c.name}.phase.g") if has else None
+
+    def phase_value(self, c: Constituent, g: Any, nu: Any) -> Any:
+        """Phase function of a constituent (1/sr), a number or a spectrum."""
+        if g is None:
+            return mi.Float(c.phase.value(nu))
+        if self.wavelengths.uniform(f"{c.name}.phase.g", self.values):
+            return density(type(c.phase), g[0], nu)
+        return mi.UnpolarizedSpectrum(*(density(type(c.phase), g[i], nu) for i in range(len(g))))
 
     # ---- majorants
 

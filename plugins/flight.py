@@ -27,8 +27,10 @@ from atmo_jit.quadrature import gauss_legendre, running_integral
 from .air import Air, largest
 
 NODES = 4
-# Scale heights at which flights are cut.
-LEVELS = (2.0, 5.0, 9.0)
+# Scale heights at which flights are cut: of thin air, and of air with a vertical optical depth above THICK, of which
+# smaller parts count.
+LEVELS, THICK_LEVELS = (2.0, 5.0, 9.0), (1.0, 2.5, 4.5, 7.0, 10.0, 14.0, 19.0)
+THICK = 1.0
 MAX_DEPTH = 1.0  # optical depth of a piece in the most opaque channel: bounds the weights within a piece
 SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
 STEEPEST = 20.0  # of the exponential within a piece from which a point is drawn
@@ -41,7 +43,9 @@ def levels(atmosphere: Atmosphere) -> np.ndarray:
     found = set(kinks)
     for c in atmosphere.constituents:
         if isinstance(c.profile, Exponential):
-            found |= {c.profile.scale_height_m * f for f in LEVELS if c.profile.scale_height_m * f < top}
+            height = float(c.profile.scale_height_m)
+            thick = float(np.max(c.extinction_per_m)) * height > THICK
+            found |= {height * f for f in (THICK_LEVELS if thick else LEVELS) if height * f < top}
     kept = [0.0]
     for level in sorted(found):
         # A cut for smoothness close to another one only costs time.
@@ -68,9 +72,9 @@ class Scattering:
     scattering coefficient over the density of the draw, an unpolarised spectrum."""
 
     transmittance: Any
-    total: Any = None
-    distance: Any = None
-    weight: Any = None
+    total: Any
+    distance: Any
+    weight: Any
 
 
 def flight(air: Air, ray: Any, reach: Any) -> Flight:
@@ -104,11 +108,15 @@ class Airway:
         constituents = air.atmosphere.constituents
         self.extinction = [dr.detach(air.extinction(c, value)) for c in constituents]
         self.scattering = [None if c.phase is None else dr.detach(air.scattering(c, value)) for c in constituents]
+        self._asymmetries = [air.asymmetry(c, value) for c in constituents]
         edges = levels(air.atmosphere)
         self._levels, self._count = mi.Float(edges.tolist()), len(edges)
-        bound = sum((largest(c.profile, edges)[:, None] * c.extinction_per_m for c in constituents), np.zeros((1, 1)))
-        rows = [np.broadcast_to(bound, (len(edges) - 1, air.wavelengths.total))[:, list(r)].max(axis=1) for r in air.wavelengths.rows]
-        self._densest = mi.Float(np.maximum(rows, 1e-30).ravel().tolist())
+        # Of every piece the largest extinction (1/m) that a path may meet there.
+        bound = np.full((len(edges) - 1, air.wavelengths.total), 1e-30)
+        for c in constituents:
+            bound += largest(c.profile, edges)[:, None] * c.extinction_per_m
+        rows = [bound[:, list(row)].max(axis=1) for row in air.wavelengths.rows]
+        self._densest = mi.Float(np.concatenate(rows).tolist())
         self._row = air.wavelengths.row(interaction) * (len(edges) - 1)
         dr.make_opaque(self._levels, self._densest)
         self._x, self._w = (v.tolist() for v in gauss_legendre(NODES))
@@ -122,13 +130,22 @@ class Airway:
             total += extinction * amount
         return total
 
-    def scattered(self, densities: list[Any]) -> Any:
-        """Scattering coefficient (1/m) at given densities."""
+    def scattered(self, densities: list[Any], worth: list[Any] | None = None) -> Any:
+        """Scattering coefficient (1/m) at given densities, each constituent's times its ``worth``."""
         total = mi.UnpolarizedSpectrum(0.0)
-        for scattering, density in zip(self.scattering, densities, strict=True):
+        for k, (scattering, density) in enumerate(zip(self.scattering, densities, strict=True)):
             if scattering is not None:
-                total += scattering * density
+                total += scattering * (density if worth is None else density * worth[k])
         return total
+
+    def phase_values(self, nu: Any) -> list[Any]:
+        """Phase function (1/sr) of every constituent at a cosine, the mean over the channels; None where it has
+        none."""
+        found = []
+        for c, g in zip(self.air.atmosphere.constituents, self._asymmetries, strict=True):
+            value = None if c.phase is None else self.air.phase_value(c, g, nu)
+            found.append(value if value is None or isinstance(value, mi.Float) else dr.mean(value))
+        return found
 
     def _first_shell(self, f: Flight) -> Any:
         falling = f.mu < 0.0
@@ -139,82 +156,27 @@ class Airway:
 
         return dr.clip(mi.Int32(dr.binary_search(0, self._count - 1, below)) - 1, 0, self._count - 2)
 
+    def amounts(self, f: Flight) -> list[Any]:
+        """Column density (m) of every constituent on a flight."""
+        return self._follow(f)[2]
+
     def transmittance(self, f: Flight) -> Any:
         """Transmittance of a flight."""
-        return self.fly(f).transmittance
+        return dr.exp(-self.depth(self.amounts(f)))
 
-    def fly(self, f: Flight, importance: Any = None, sample1: Any = None, sample2: Any = None) -> Scattering:
-        """Transmittance of a flight, and with ``importance`` (what light of each channel is worth) a point on it.
+    def fly(self, f: Flight, importance: Any, sample1: Any, sample2: Any, worth: Any = None) -> Scattering:
+        """Transmittance of a flight, and a point on it.
 
-        sample1, sample2: uniform numbers."""
-        radius = self.air.radius
-        draws = importance is not None
-        perigee = perigee_altitude(radius, f.h, f.mu)
-        r_mu = (radius + f.h) * f.mu
-        count, last = len(self.extinction), self._count - 2
+        importance: what light of each channel is worth to the path; sample1, sample2: uniform numbers; worth:
+        function of (distance, altitude, radius) that says what light scattered there is worth [constituent], the same
+        everywhere if there is none."""
+        count = len(self.extinction)
+        _, _, amounts, _, total, kept, before = self._follow(f, importance, sample1, worth)
+        transmittance = dr.exp(-self.depth(amounts))
 
         def density_at(distance: Any) -> list[Any]:
-            return self.air.densities(altitude_along(radius, f.h, f.mu, distance)[0])
+            return self.air.densities(altitude_along(self.air.radius, f.h, f.mu, distance)[0])
 
-        def piece(d: Any, shell: Any, amounts: list[Any], u: Any, total: Any, kept: list[Any], before: list[Any]):
-            falling = r_mu + d < 0.0
-            target = dr.gather(mi.Float, self._levels, mi.UInt32(dr.select(falling, shell, shell + 1)))
-            bottoms_out = falling & (target <= perigee)
-            crossing = dr.select(
-                falling, distance_down(radius, f.h, f.mu, target), distance_up(radius, f.h, f.mu, target)
-            )
-            crossing = dr.maximum(dr.select(bottoms_out, -r_mu, crossing), d)
-            # Beyond the outermost levels there is nothing: the end, known a little differently, must still be reached.
-            leaves = ~bottoms_out & dr.select(falling, shell == 0, shell == last)
-            crossing = dr.select(leaves, dr.inf, crossing)
-            limit = d + MAX_DEPTH / dr.gather(mi.Float, self._densest, self._row + mi.UInt32(shell)) if draws else f.length
-            end = dr.minimum(dr.minimum(crossing, f.length), limit)
-            length = end - d
-            densities = [density_at(dr.fma(length, x, d)) for x in self._x]
-            column = [length * sum(w * row[k] for w, row in zip(self._w, densities, strict=True)) for k in range(count)]
-            crossed = end >= crossing
-            if draws:
-                rates = []
-                for running, row in zip(self._running, densities, strict=True):
-                    inside = [
-                        dr.fma(length, sum(a * other[k] for a, other in zip(running, densities, strict=True)), amounts[k])
-                        for k in range(count)
-                    ]
-                    rates.append(dr.sum(importance * self.scattered(row) * dr.exp(-self.depth(inside))))
-                share = length * sum(w * rate for w, rate in zip(self._w, rates, strict=True))
-                total = total + share
-                chance = dr.select(share > 0.0, share / total, 0.0)
-                take = u < chance
-                u = dr.select(take, u / chance, (u - chance) / (1.0 - chance))
-                slope = dr.log(rates[-1] / rates[0]) * (1.0 / (self._x[-1] - self._x[0]))
-                slope = dr.select(dr.isfinite(slope), dr.clip(slope, -STEEPEST, STEEPEST), 0.0)
-                found = (d, length, slope, share)
-                kept = [dr.select(take, new, old) for new, old in zip(found, kept, strict=True)]
-                before = [dr.select(take, new, old) for new, old in zip(amounts, before, strict=True)]
-            amounts = [a + c for a, c in zip(amounts, column, strict=True)]
-            shell = dr.select(
-                crossed & ~bottoms_out, dr.clip(shell + dr.select(falling, -1, 1), 0, last), shell
-            )
-            return end, shell, amounts, u, total, kept, before
-
-        def unfinished(d: Any, shell: Any, amounts: list[Any], *_: Any) -> Any:
-            return (d < f.length) & (dr.min(self.depth(amounts)) < SPENT_DEPTH)
-
-        width = dr.width(f.length)
-        zero = dr.zeros(mi.Float, width)
-        state = (
-            zero + 0.0,
-            self._first_shell(f),
-            [zero + 0.0 for _ in range(count)],
-            zero + sample1 if draws else zero + 0.0,
-            zero + 0.0,
-            [zero + 0.0 for _ in range(4)],
-            [zero + 0.0 for _ in range(count)],
-        )
-        _, _, amounts, _, total, kept, before = dr.while_loop(state, unfinished, piece, label="flight")
-        transmittance = dr.exp(-self.depth(amounts))
-        if not draws:
-            return Scattering(transmittance)
         begin, length, slope, share = kept
         flat = dr.abs(slope) < 1e-3
         growth = dr.exp(slope) - 1.0
@@ -232,3 +194,71 @@ class Airway:
         weight = self.scattered(density_at(distance)) * dr.exp(-self.depth(inside))
         weight = dr.select(share > 0.0, weight / density, 0.0)
         return Scattering(transmittance, total, distance, weight)
+
+    def _follow(self, f: Flight, importance: Any = None, sample: Any = None, worth: Any = None) -> tuple[Any, ...]:
+        """Go along a flight: the loop's state at its end."""
+        radius = self.air.radius
+        draws = importance is not None
+        perigee = perigee_altitude(radius, f.h, f.mu)
+        r_mu = (radius + f.h) * f.mu
+        count, last = len(self.extinction), self._count - 2
+
+        def piece(d: Any, shell: Any, amounts: list[Any], u: Any, total: Any, kept: list[Any], before: list[Any]):
+            falling = r_mu + d < 0.0
+            target = dr.gather(mi.Float, self._levels, mi.UInt32(dr.select(falling, shell, shell + 1)))
+            bottoms_out = falling & (target <= perigee)
+            crossing = dr.select(
+                falling, distance_down(radius, f.h, f.mu, target), distance_up(radius, f.h, f.mu, target)
+            )
+            crossing = dr.maximum(dr.select(bottoms_out, -r_mu, crossing), d)
+            # Beyond the outermost levels there is nothing: the end, known a little differently, must still be reached.
+            leaves = ~bottoms_out & dr.select(falling, shell == 0, shell == last)
+            crossing = dr.select(leaves, dr.inf, crossing)
+            end = dr.minimum(crossing, f.length)
+            if draws:
+                densest = dr.gather(mi.Float, self._densest, self._row + mi.UInt32(shell))
+                end = dr.minimum(end, d + MAX_DEPTH / densest)
+            length = end - d
+            places = [dr.fma(length, x, d) for x in self._x]
+            points = [altitude_along(radius, f.h, f.mu, place) for place in places]
+            densities = [self.air.densities(h) for h, _ in points]
+            column = [length * sum(w * row[k] for w, row in zip(self._w, densities, strict=True)) for k in range(count)]
+            crossed = end >= crossing
+            if draws:
+                rates = []
+                for place, point, running, row in zip(places, points, self._running, densities, strict=True):
+                    inside = [
+                        dr.fma(length, sum(a * other[k] for a, other in zip(running, densities, strict=True)), start)
+                        for k, start in enumerate(amounts)
+                    ]
+                    scattered = self.scattered(row, worth and worth(place, *point))
+                    rates.append(dr.sum(importance * scattered * dr.exp(-self.depth(inside))))
+                share = length * sum(w * rate for w, rate in zip(self._w, rates, strict=True))
+                total = total + share
+                chance = dr.select(share > 0.0, share / total, 0.0)
+                take = u < chance
+                u = dr.select(take, u / chance, (u - chance) / (1.0 - chance))
+                slope = dr.log(rates[-1] / rates[0]) * (1.0 / (self._x[-1] - self._x[0]))
+                slope = dr.select(dr.isfinite(slope), dr.clip(slope, -STEEPEST, STEEPEST), 0.0)
+                found = (d, length, slope, share)
+                kept = [dr.select(take, new, old) for new, old in zip(found, kept, strict=True)]
+                before = [dr.select(take, new, old) for new, old in zip(amounts, before, strict=True)]
+            amounts = [a + c for a, c in zip(amounts, column, strict=True)]
+            shell = dr.select(crossed & ~bottoms_out, dr.clip(shell + dr.select(falling, -1, 1), 0, last), shell)
+            return end, shell, amounts, u, total, kept, before
+
+        def unfinished(d: Any, shell: Any, amounts: list[Any], *_: Any) -> Any:
+            return (d < f.length) & (dr.min(self.depth(amounts)) < SPENT_DEPTH)
+
+        width = dr.width(f.length)
+        zero = dr.zeros(mi.Float, width)
+        state = (
+            zero + 0.0,
+            self._first_shell(f),
+            [zero + 0.0 for _ in range(count)],
+            zero + sample if draws else zero + 0.0,
+            zero + 0.0,
+            [zero + 0.0 for _ in range(4)],
+            [zero + 0.0 for _ in range(count)],
+        )
+        return dr.while_loop(state, unfinished, piece, label="flight")

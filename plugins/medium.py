@@ -177,5 +177,5 @@ class AtmosphereMedium:
 
 def _atmosphere(props: Any) -> Atmosphere:
     """The atmosphere of the properties, with the values that they replace."""
-    atmosphere = settings._atmosphere(props, lambda name: str(mi.file_resolver().resolve(name)))
-    return atmosphere.replace(dict(settings._overrides(props, atmosphere)))
+    atmosphere = settings.atmosphere_of(props, lambda name: str(mi.file_resolver().resolve(name)))
+    return atmosphere.replace(dict(settings.overrides(props, atmosphere)))

@@ -87,19 +87,11 @@ class AirPhase:
         """Value of the phase function (a spectrum) and density of the directions drawn, at a cosine."""
         mixed = mi.UnpolarizedSpectrum(0.0)
         for c, scattering, g in parts:
-            mixed += scattering * self._value(c, g, nu)
+            mixed += scattering * self.air.phase_value(c, g, nu)
         pdf = mi.Float(0.0)
         for share, c, g in proposals:
             pdf += share * self._density(c, g, nu)
         return dr.select(total > 0.0, mixed / total, 0.0), pdf
-
-    def _value(self, c: Constituent, g: Any, nu: Any) -> Any:
-        """Phase function of a constituent (1/sr), a number or a spectrum."""
-        if g is None:
-            return mi.Float(c.phase.value(nu))
-        if self.air.wavelengths.uniform(f"{c.name}.phase.g", self.air.values):
-            return density(type(c.phase), g[0], nu)
-        return mi.UnpolarizedSpectrum(*(density(type(c.phase), g[i], nu) for i in range(len(g))))
 
     def _density(self, c: Constituent, g: Any, nu: Any) -> Any:
         if g is not None:

@@ -25,6 +25,15 @@ BATCH = 2**20
 ROULETTE_DEPTH = 1000
 
 
+def tracer_of(name: str, max_depth: int = -1, **options: Any) -> Any:
+    """An integrator for :func:`trace`, ``options`` as for ``mi.load_dict``.
+
+    The roulette of Mitsuba's own integrators would end paths in the air that have lost little.
+    """
+    roulette = {} if name == "atmosphere_volpath" else {"rr_depth": ROULETTE_DEPTH}
+    return mi.load_dict({"type": name, "max_depth": max_depth, **roulette, **options})
+
+
 def trace(
     scene: Any,
     medium: Any,
@@ -35,16 +44,15 @@ def trace(
     *,
     seed: int = 0,
     max_depth: int = -1,
-    integrator: str = "volpath",
+    integrator: Any = "atmosphere_volpath",
     advance: Callable[[float], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean radiance, its standard error, and the number of samples that were not 0: [N, channels], [N, channels], [N].
 
     origin, direction: [N, 3], scene units; time [N], None for random ones from 0 to 1; medium: the one that the rays
-    start in; samples: of each ray, rounded up to whole batches. For vectorised variants that are not polarised."""
-    # The stock integrators' roulette does not know that a bounce in the air loses little.
-    depth = {} if integrator == "atmosphere_volpath" else {"rr_depth": ROULETTE_DEPTH}
-    tracer = mi.load_dict({"type": integrator, "max_depth": max_depth, **depth})
+    start in; samples: of each ray, rounded up to whole batches; integrator: its name, or one that was made before (and
+    then knows its own max_depth). For vectorised variants that are not polarised."""
+    tracer = tracer_of(integrator, max_depth) if isinstance(integrator, str) else integrator
     sampler = mi.load_dict({"type": "independent"})
     count = len(origin)
     each = max(1, min(samples, BATCH // count))

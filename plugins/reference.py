@@ -1,9 +1,10 @@
 """Any scene with the emitter ``atmosphere``, with the path-traced air in its place.
 
 ``edit`` changes what the parser read: the emitter becomes its own sun (plugin ``atmosphere_sun``), the integrator
-becomes ``volpath`` without limit of depth, cameras see as far as there is air. ``planet_of`` gives what has to be
-added to the scene: air and ground, placed so that the scene's origin is at the emitter's ``altitude``. Everything
-else in the scene stays.
+becomes ``atmosphere_volpath`` without limit of depth (``volpath`` in scalar and polarised variants, and for scenes with
+``null`` surfaces or media of their own), cameras see as far as there is air. ``planet_of`` gives what has to be added
+to the scene: air and ground, placed so that the scene's origin is at the emitter's ``altitude``. Everything else in the
+scene stays.
 
 What the picture then shows is what the emitter shows, except that air is also between the camera and the things in
 the scene, that light goes back and forth between those and the planet's own ground, and that the medium scatters the
@@ -15,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -30,6 +32,7 @@ REPLACED = ("path", "direct", "volpath", "volpathmis", "atmosphere_path")
 FAR_CLIP = 1e8
 # Paths of this depth are ended by chance: a bounce in the air loses little, so earlier would only add noise.
 ROULETTE_DEPTH = 32
+LOW_SUN = 0.05  # cosine of the zenith angle
 
 
 class AtmosphereSun(Sun):
@@ -59,8 +62,17 @@ class AtmosphereSun(Sun):
         self.shine(unit, radius, found.sun_scale * colours, wavelengths, nm)
 
 
-def edit(state: Any) -> None:
-    """Change the parsed scene; raises InputError where it has no, or more than one, emitter ``atmosphere``."""
+def _shortcut(state: Any) -> bool:
+    """Whether ``atmosphere_volpath`` can render the scene."""
+    foreign = any(
+        node.type == mi.ObjectType.Medium or _is(node, mi.ObjectType.BSDF, ("null", "mask")) for node in state.nodes
+    )
+    return dr.is_jit_v(mi.Float) and not mi.is_polarized and not foreign
+
+
+def edit(state: Any, low: bool = False) -> None:
+    """Change the parsed scene; ``low``: the sun is near the horizon or below it. Raises InputError where the scene has
+    no, or more than one, emitter ``atmosphere``."""
     lights = [node.props for node in state.nodes if _is(node, mi.ObjectType.Emitter, ("atmosphere",))]
     if len(lights) != 1:
         raise InputError(f"--reference: the scene has {len(lights)} emitters of type atmosphere; must be one")
@@ -69,13 +81,18 @@ def edit(state: Any) -> None:
         props = node.props
         if node.type == mi.ObjectType.Integrator:
             if props.plugin_name() not in REPLACED:
-                allowed = f"one of {', '.join(REPLACED)}, which volpath replaces"
+                allowed = f"one of {', '.join(REPLACED)}, which a volumetric one replaces"
                 raise InputError(f"--reference: the scene's integrator is {props.plugin_name()}; must be {allowed}")
             for name in list(props.keys()):
                 if name != "hide_emitters":
                     del props[name]
-            props.set_plugin_name("volpath")
-            props["max_depth"], props["rr_depth"] = -1, ROULETTE_DEPTH
+            if _shortcut(state):
+                props.set_plugin_name("atmosphere_volpath")
+                # While the sun is low few paths find the light by themselves.
+                props["guided"] = low
+            else:
+                props.set_plugin_name("volpath")
+                props["max_depth"], props["rr_depth"] = -1, ROULETTE_DEPTH
         elif node.type == mi.ObjectType.Sensor:
             props["shutter_open"], props["shutter_close"] = 0.0, 1.0
             if props.plugin_name() in ("perspective", "thinlens", "orthographic"):
@@ -113,10 +130,13 @@ def load_reference(load: Callable[[Callable[[Any], None]], Any]) -> Any:
 
     It is called twice: what the air needs to know is known only after the emitter's parameters have been read.
     """
-    parts = planet_of(load(edit))
+    scene = load(edit)
+    parts = planet_of(scene)
+    (sun,) = (e for e in scene.emitters() if hasattr(e, "found"))
+    low = float(np.dot(sun.sun_vector, sun.up)) < LOW_SUN
 
     def edit_and_add(state: Any) -> None:
-        edit(state)
+        edit(state, low)
         add(state, parts)
 
     scene = load(edit_and_add)

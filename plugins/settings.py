@@ -61,8 +61,8 @@ def read(props: Any, find_file: Any, albedo: Any = None) -> Settings:
     """
     if "turbidity" in props:
         raise AtmosphereError("turbidity", shown(props["turbidity"]), _instead_of(props["turbidity"]))
-    atmosphere = _atmosphere(props, find_file)
-    changes = dict(_overrides(props, atmosphere))
+    atmosphere = atmosphere_of(props, find_file)
+    changes = dict(overrides(props, atmosphere))
     if albedo is not None and "ground_albedo" in changes:
         raise InputError("albedo: found together with ground_albedo; allowed: one of the two")
     if "sun_aperture" in props:
@@ -154,7 +154,7 @@ def _instead_of(turbidity: Any) -> str:
     return f"{AEROSOL}; about mie.scattering_per_m = {0.9 * depth / 1200.0:.1e} at this one"
 
 
-def _atmosphere(props: Any, find_file: Any) -> Atmosphere:
+def atmosphere_of(props: Any, find_file: Any) -> Atmosphere:
     source = props.get("atmosphere", "earth")
     if not isinstance(source, str):
         return Atmosphere.load(source)  # its message says what is allowed
@@ -167,7 +167,7 @@ def _atmosphere(props: Any, find_file: Any) -> Atmosphere:
     return Atmosphere.load(found if found.is_file() else source)
 
 
-def _overrides(props: Any, atmosphere: Atmosphere) -> Iterable[tuple[str, Any]]:
+def overrides(props: Any, atmosphere: Atmosphere) -> Iterable[tuple[str, Any]]:
     """Atmosphere values among the properties, under their dotted names.
 
     Mitsuba's dict loader refuses dots in keys, so ``mie_phase_g`` stands for ``mie.phase.g`` there.

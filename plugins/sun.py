@@ -83,6 +83,7 @@ class Sun:
         self._parallel = radius_deg == 0.0
         shape = mi.EmitterFlags.DeltaDirection if self._parallel else mi.EmitterFlags.SpatiallyVarying
         self.m_flags = mi.EmitterFlags.Infinite | shape
+        self.sun_vector = np.asarray(direction, dtype=np.float64)
         self._direction = mi.Vector3f(*(float(v) for v in direction))
         if dr.is_jit_v(mi.Float):
             dr.make_opaque(self._direction)

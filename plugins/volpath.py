@@ -10,7 +10,9 @@ import mitsuba as mi
 from atmo_jit.errors import AtmosphereError, shown
 
 from .flight import Airway, flight
+from .guide import Guide
 
+CANDIDATES = 4
 # What light at a surface is worth beside light that scatters before it, for the choice between the two: a white
 # surface sends 1/pi of it in every direction, air 1/(4 pi). Any positive numbers leave the mean as it is.
 LAMBERTIAN, LOBE_WORTH, BLACK_WORTH = 4.0, 1.0, 0.1
@@ -68,6 +70,8 @@ class AtmosphereVolpath:
         if self.max_depth < -1:
             raise AtmosphereError("max_depth", shown(self.max_depth), "a whole number >= 0, or -1 for no limit")
         self.rr_depth = int(props.get("rr_depth", 2))
+        self.guided = bool(props.get("guided", False))
+        self._guide, self._guide_key = None, None
         self.hide_emitters = bool(props.get("hide_emitters", False))
 
     @dr.syntax
@@ -76,6 +80,7 @@ class AtmosphereVolpath:
     ) -> tuple[Any, Any, list[Any]]:
         air_medium = medium_of(scene, medium)
         air, phase = air_medium.air, air_medium.phase_function()
+        guide = self._guide_of(scene, air)
         context, bsdf_context = mi.PhaseFunctionContext(sampler), mi.BSDFContext()
         most = mi.UInt32(0xFFFFFFFF if self.max_depth < 0 else self.max_depth)
 
@@ -95,7 +100,8 @@ class AtmosphereVolpath:
             si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
             surface = active & si.is_valid()
             f = flight(air, ray, dr.select(surface, si.t, dr.inf))
-            fly = way.fly(f, worth, sampler.next_1d(active), sampler.next_1d(active))
+            guided = guide.along(way, f, ray) if guide is not None else None
+            fly = way.fly(f, worth, sampler.next_1d(active), sampler.next_1d(active), guided)
 
             # What shines at the end of the flight.
             emitter = si.emitter(scene, active)
@@ -113,6 +119,8 @@ class AtmosphereVolpath:
             bsdf = si.bsdf()
             reflectance = unpolarized(bsdf.eval_diffuse_reflectance(si, surface))
             reflectance = dr.maximum(LAMBERTIAN * reflectance, dr.select(has_lobe(bsdf), LOBE_WORTH, BLACK_WORTH))
+            if dr.hint(guide is not None, mode="scalar"):
+                reflectance *= guide.irradiance(ray, si.p) * (0.25 * dr.inv_pi)
             behind = dr.select(surface, dr.mean(worth * fly.transmittance * reflectance), 0.0)
             here = fly.total * (1.0 / len(worth))
             probability = dr.select(here > 0.0, here / (here + behind), 0.0)
@@ -135,7 +143,8 @@ class AtmosphereVolpath:
             smooth = on_surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             connects = in_air | smooth
             ds, light = scene.sample_emitter_direction(point, sampler.next_2d(connects), False, connects)
-            connects &= ds.pdf != 0.0
+            # A point that touches a lamp has a density of infinity or none.
+            connects &= (ds.pdf > 0.0) & dr.isfinite(ds.pdf) & dr.isfinite(dr.sum(unpolarized(light)))
             toward = point.spawn_ray_to(ds.p)
             connects &= ~scene.ray_test(toward, connects)
             between = way.transmittance(flight(air, toward, dr.select(connects, toward.maxt, 0.0)))
@@ -148,9 +157,7 @@ class AtmosphereVolpath:
 
             # Go on.
             seen |= active
-            wo, phase_weight, phase_pdf = phase.sample(
-                context, mei, sampler.next_1d(in_air), sampler.next_2d(in_air), in_air
-            )
+            wo, phase_weight, phase_pdf = self._scatter(guide, phase, context, mei, sampler, in_air)
             bs, bsdf_weight = bsdf.sample(
                 bsdf_context, si, sampler.next_1d(on_surface), sampler.next_2d(on_surface), on_surface
             )
@@ -168,7 +175,53 @@ class AtmosphereVolpath:
             active &= (largest > 0.0) & (~ends | (sampler.next_1d(active) < survives))
             worth *= dr.select(ends, 1.0 / dr.maximum(survives, 1e-12), 1.0)
 
-        return mi.Spectrum(result), seen, [mi.Float(depth)]
+        return mi.Spectrum(result), seen, []
+
+    def _guide_of(self, scene: Any, air: Any) -> Any:
+        """The guide, where one is wanted."""
+        if not self.guided:
+            return None
+        suns = [e for e in scene.emitters() if hasattr(e, "sun_vector")]
+        if len(suns) != 1:
+            raise AtmosphereError("guided", f"true with {len(suns)} suns", "true with one sun of planet()")
+        sun = suns[0].sun_vector
+        if self._guide is None or self._guide_key != (id(air), id(air.majorants), tuple(sun)):
+            self._guide, self._guide_key = Guide(air, sun), (id(air), id(air.majorants), tuple(sun))
+        return self._guide
+
+    def _scatter(
+        self, guide: Any, phase: Any, context: Any, mei: Any, sampler: Any, active: Any
+    ) -> tuple[Any, Any, Any]:
+        """Direction, weight and density of the phase function; with a guide the best of CANDIDATES such directions.
+
+        Resampled importance sampling (Talbot et al. 2005): one of them is taken in proportion to what arrives from
+        there, and weighted by the mean over that of the one taken."""
+        wo, weight, pdf = phase.sample(context, mei, sampler.next_1d(active), sampler.next_2d(active), active)
+        if guide is None:
+            return wo, weight, pdf
+        row = guide.air.wavelengths.row(mei)
+        place = guide.here(mei.p)
+        arriving = guide.radiance(row, *place, wo)
+        total = arriving * dr.mean(unpolarized(weight))
+        for _ in range(1, CANDIDATES):
+            other, other_weight, other_pdf = phase.sample(
+                context, mei, sampler.next_1d(active), sampler.next_2d(active), active
+            )
+            found = guide.radiance(row, *place, other)
+            share = found * dr.mean(unpolarized(other_weight))
+            total += share
+            take = sampler.next_1d(active) * total < share
+            wo, weight, pdf = (
+                dr.select(take, other, wo),
+                dr.select(take, other_weight, weight),
+                dr.select(take, other_pdf, pdf),
+            )
+            arriving = dr.select(take, found, arriving)
+        factor = total * (1.0 / CANDIDATES) / (arriving * dr.mean(unpolarized(weight)))
+        return wo, weight * dr.select(active, factor, 0.0), pdf
+
+    def to_string(self) -> str:
+        return f"AtmosphereVolpath[max_depth = {self.max_depth}, guided = {self.guided}]"
 
 
 def has_lobe(bsdf: Any) -> Any:

@@ -43,16 +43,16 @@ PICTURES: dict[str, tuple[dict[str, Any], float, tuple[float, float, float], flo
 }
 
 
-def scene(name: str, integrator: str = "volpath") -> Any:
-    """The Mitsuba scene of a picture, in the variant that is set."""
+def scene(name: str, integrator: str = "volpath", sun: bool = True, **options: Any) -> Any:
+    """The Mitsuba scene of a picture, in the variant that is set; ``options`` of the integrator."""
     import mitsuba as mi
 
     from atmo_jit import Atmosphere
     from atmo_jit.plugins.planet import planet
 
     changes, altitude, axis, zenith = PICTURES[name]
-    sun = np.radians(zenith)
-    parts = planet(Atmosphere.load("earth").replace(changes), sun_direction=[np.sin(sun), 0.0, np.cos(sun)])
+    angle = np.radians(zenith)
+    parts = planet(Atmosphere.load("earth").replace(changes), sun_direction=[np.sin(angle), 0.0, np.cos(angle)])
     origin = np.array([0.0, 0.0, altitude])
     sensor = {
         "type": "fisheye",
@@ -63,8 +63,12 @@ def scene(name: str, integrator: str = "volpath") -> Any:
         "shutter_open": 0.0,
         "shutter_close": 1.0,
     }
-    depth = {"type": integrator, "max_depth": -1, "rr_depth": 64}
-    return mi.load_dict({"type": "scene", "integrator": depth, "sensor": sensor, **parts})
+    if integrator != "atmosphere_volpath":
+        options = {"rr_depth": 64, **options}
+    if not sun:
+        del parts["sun"]
+    tracer = {"type": integrator, "max_depth": -1, **options}
+    return mi.load_dict({"type": "scene", "integrator": tracer, "sensor": sensor, **parts})
 
 
 def render(scene: Any, passes: int, seed: int) -> np.ndarray:
