@@ -115,9 +115,12 @@ def _process(words: tuple[str, ...], repeats: int, backend: str, folder: Path) -
 def cost(
     method: str, setting: str, atmosphere: str = "earth", repeats: int = REPEATS, backend: str = "llvm"
 ) -> dict[str, Any]:
-    """``cold``: the first solve of a process with an empty kernel cache; ``cached``: with a full one; ``warm``: the
-    median of ``repeats`` later solves (0: that of ``cached`` again, where a solve takes minutes); each wall and CPU seconds beyond imports. ``peak_mib`` beyond imports, kernels from the cache;
-    ``solution_bytes``."""
+    """What a solve of a method costs, kernels compiled, read from disk, or ready.
+
+    ``cold``: the first solve of a process with an empty kernel cache; ``cached``: with a full one; ``warm``: the median
+    of ``repeats`` later solves (0: that of ``cached`` again, where a solve takes minutes); each wall and CPU seconds
+    beyond imports. ``peak_mib`` beyond imports, kernels from the cache; ``solution_bytes``.
+    """
     with tempfile.TemporaryDirectory() as name:
         cold = _process((method, setting, atmosphere), 0, backend, Path(name))
         cached = _process((method, setting, atmosphere), repeats, backend, Path(name))

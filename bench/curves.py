@@ -157,8 +157,8 @@ HEAD = """## How cost grows
 times: the 95th percentile of the difference falls with the power {order:.2f} of the factor, the cost grows with the
 power {cost_power:.2f}.
 """
-WAVES = """**Wavelengths.** A solve takes {fixed:.3f} + {each:.4f} W CPU seconds, within {deviation:.0f} % (groups of four
-share their geometry).
+WAVES = """**Wavelengths.** A solve takes {fixed:.3f} + {each:.4f} W CPU seconds, within {deviation:.0f} % (groups of
+four share their geometry).
 """
 RAYS = """**Views.** An evaluation takes {fixed:.1f} ms + {each:.2f} us per ray of CPU time, within {deviation:.0f} %.
 """
