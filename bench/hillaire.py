@@ -113,9 +113,13 @@ class MultipleScattering:
             for c in channels:
                 scattering = sum((optics.scattering[k][c] * density[k] for k in optics.scatterers), start=0.0 * d)
                 extinction = sum((optics.extinction[k][c] * density[k] for k in range(len(density))), start=0.0 * d)
-                # Constant over a step: its integral is exact (section 5.5, energy conserving).
-                passed = dr.exp(-extinction * step)
-                held = dr.select(extinction > 0.0, (1.0 - passed) / dr.select(extinction > 0.0, extinction, 1.0), step)
+                # Constant over a step: its integral is exact (section 5.5, energy conserving); in thin air by its
+                # series, which does not cancel.
+                depth = extinction * step
+                passed = dr.exp(-depth)
+                thin = depth < 0.01
+                series = 1.0 - depth * (0.5 - depth * (1.0 / 6.0))
+                held = step * dr.select(thin, series, (1.0 - passed) / dr.select(thin, 1.0, depth))
                 share = through[c] * held * scattering
                 glow[c] = glow[c] + share
                 light[c] = dr.fma(share * lit[c], 0.25 * dr.inv_pi, light[c])
