@@ -20,7 +20,7 @@ from atmo_jit.errors import InputError
 from atmo_jit.resolution import Resolution
 
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
-SCALES = (0.5, 0.7, 1.0, 1.4, 2.0)
+SCALES = (0.5, 0.7, 1.0, 1.4)
 DEFAULT_TOLERANCE = 0.01  # of atmo_jit.sky
 # What a scale leaves as it is: the bound on the number of orders is no size.
 UNSCALED = ("orders", "first_suns", "refine")

@@ -20,7 +20,7 @@ from .cost import timed
 from .truth import FEW_CASES, Truth
 
 STREAMS = ((8, 1), (16, 1), (16, 9))
-SAMPLES = (256, 4096)
+SAMPLES = (64, 1024)
 WIDTH, HEIGHT = 1280, 720
 
 
