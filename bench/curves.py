@@ -15,7 +15,7 @@ from .methods import DEFAULT_TOLERANCE, OwnSky, columns_of, scaled
 from .page import table
 from .speed import random_views
 
-FACTORS, FINEST = (0.35, 0.5, 0.7, 1.0, 1.4), 2.8
+FACTORS, FINEST = (0.5, 0.7, 1.0, 1.4), 2.8
 WAVELENGTHS = (1, 2, 4, 8, 16, 24, 40)
 
 
@@ -26,7 +26,7 @@ def measure(
     air = Atmosphere.load(atmosphere)
     repeats = 1 if quick else 5
     result = {
-        "resolution": resolutions(air, (0.35, 0.5), 1.0, 100) if quick else resolutions(air, FACTORS, FINEST),
+        "resolution": resolutions(air, (0.5, 0.7), 1.0, 100) if quick else resolutions(air, FACTORS, FINEST),
         "wavelengths": wavelengths(air, (1, 4) if quick else WAVELENGTHS, repeats),
         "views": views(air, 10**3 if quick else most_views, repeats),
         "threads": threads(air, repeats),

@@ -22,6 +22,7 @@ from atmo_jit.resolution import Resolution
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
 SCALES = (0.5, 0.7, 1.0, 1.4)
 DEFAULT_TOLERANCE = 0.01  # of atmo_jit.sky
+FEWEST = 4  # no count is scaled below this: directions are split in parts, each with its own
 # What a scale leaves as it is: the bound on the number of orders is no size.
 UNSCALED = ("orders", "first_suns", "refine")
 
@@ -81,7 +82,7 @@ def scaled(resolution: Resolution, factor: float) -> Resolution:
     def times(value: Any) -> Any:
         if isinstance(value, tuple):
             return tuple(times(v) for v in value)
-        return max(2, round(factor * value))
+        return max(min(value, FEWEST), round(factor * value))
 
     counts = {f.name: getattr(resolution, f.name) for f in fields(resolution)}
     whole = {k: v for k, v in counts.items() if k not in UNSCALED and _is_count(v)}

@@ -85,7 +85,7 @@ def test_scaled_resolutions():
     assert scaled(base, 1.0) == base
     assert (half.altitudes, twice.altitudes) == (base.altitudes // 2, 2 * base.altitudes)
     assert twice.orders == base.orders and twice.first_suns == base.first_suns
-    assert scaled(base, 1e-3).suns == 2
+    assert scaled(base, 1e-3).suns == 4
 
 
 @pytest.mark.parametrize("setting", ["", "tolerance", "tolerance x", "tolerance -1", "times 1", "tolerance 0"])
