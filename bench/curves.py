@@ -79,7 +79,9 @@ def spectral(air: Atmosphere, count: int) -> Atmosphere:
 
     def resample(node: Any) -> Any:
         if isinstance(node, dict):
-            return {k: v if k in ("profile", "phase") else resample(v) for k, v in node.items()}
+            # Lists that are not per wavelength: profiles, and tabulated or expanded phase functions.
+            kept = ("profile", "cos_theta", "values", "moments")
+            return {k: v if k in kept else resample(v) for k, v in node.items()}
         if isinstance(node, list) and node and isinstance(node[0], dict):
             return [resample(v) for v in node]
         if isinstance(node, list) and len(node) == len(nm):

@@ -84,19 +84,25 @@ def needs_of_scene(load: Callable[[Callable[[Any], None]], Any]) -> SceneNeeds:
         sun = light.sun / np.linalg.norm(light.sun)
         angle = np.degrees(np.arccos(np.clip(direction @ sun, -1.0, 1.0)))
         radius = max(light.found.atmosphere.sun_angular_radius_deg, 0.5 * settings.SMALLEST_SUN_DEG)
-        # The sun may be between two rays, or behind the edge of a shape between them: that counts as seen.
-        near = bool((angle <= radius + _spacing_deg(direction)).any())
+        # The sun may be between two rays, or show beside the edge of a shape between them: both count as seen.
+        shown = np.any(direction != 0.0, axis=1)
+        near = bool((angle <= radius + _spacing_deg(direction))[shown].any())
     return SceneNeeds(light.found, light.sun_zenith_deg, sees_sky, near, int(np.prod(size)))
 
 
 def _seen(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Directions [N, 3] of COLUMNS x ROWS rays of the picture, and which of them meet no shape."""
+    """Directions [N, 3] of COLUMNS x ROWS rays of the picture (0 where it shows nothing), and which of them meet no
+    shape."""
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
-    position = mi.Point2f(*(mi.Float(v.ravel().astype(np.float32)) for v in (x, y)))
-    half = dr.full(mi.Float, 0.5, x.size)
-    ray, _ = sensor.sample_ray(half * 0.0, half, position, mi.Point2f(half, half))
-    meets = scene.ray_test(mi.Ray3f(ray.o, dr.normalize(ray.d)))
-    direction = np.array(dr.normalize(ray.d), dtype=np.float64).T
+    x, y = x.ravel().astype(np.float32), y.ravel().astype(np.float32)
+    if dr.is_jit_v(mi.Float):
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(mi.Float(x), mi.Float(y)), mi.Point2f(0.5))
+        meets = np.array(scene.ray_test(mi.Ray3f(ray.o, dr.normalize(ray.d))))
+        direction = np.array(dr.normalize(ray.d), dtype=np.float64).T
+    else:
+        rays = [sensor.sample_ray(0.0, 0.5, [float(u), float(v)], [0.5, 0.5])[0] for u, v in zip(x, y, strict=True)]
+        meets = np.array([scene.ray_test(mi.Ray3f(ray.o, dr.normalize(ray.d))) for ray in rays])
+        direction = np.array([np.array(dr.normalize(ray.d), dtype=np.float64) for ray in rays])
     inside = np.isfinite(direction).all(axis=1)  # a fisheye's corners show nothing
     return np.nan_to_num(direction), inside & ~np.broadcast_to(np.array(meets), x.size)
 
@@ -104,5 +110,8 @@ def _seen(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
 def _spacing_deg(direction: np.ndarray) -> float:
     """Largest angle between neighbouring rays, along either axis, times the diagonal's root of two."""
     table = direction.reshape(ROWS, COLUMNS, 3)
-    steps = [np.einsum("ijk,ijk->ij", table[1:], table[:-1]), np.einsum("ijk,ijk->ij", table[:, 1:], table[:, :-1])]
-    return float(np.sqrt(2.0) * max(np.degrees(np.arccos(np.clip(s, -1.0, 1.0))).max() for s in steps))
+    largest = 0.0
+    for one, other in ((table[1:], table[:-1]), (table[:, 1:], table[:, :-1])):
+        cosine = np.einsum("ijk,ijk->ij", one, other)[np.any(one != 0.0, axis=-1) & np.any(other != 0.0, axis=-1)]
+        largest = max(largest, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max(initial=0.0)))
+    return float(np.sqrt(2.0)) * largest
