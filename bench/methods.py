@@ -10,7 +10,7 @@ such split do their work in ``radiance``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,7 +24,7 @@ SCALES = (0.5, 0.7, 1.0, 1.4)
 DEFAULT_TOLERANCE = 0.01  # of atmo_jit.sky
 FEWEST = 4  # no count is scaled below this: directions are split in parts, each with its own
 # What a scale leaves as it is: the bound on the number of orders is no size.
-UNSCALED = ("orders", "first_suns", "refine")
+UNSCALED = ("orders", "first_suns", "refine", "sun_refine")
 
 
 class Solved(Protocol):
@@ -76,23 +76,21 @@ def columns_of(views: Mapping[str, np.ndarray]) -> list[Any]:
     return [doubles(views["altitude_m"]), *(doubles(angle) for angle in angles)]
 
 
-def scaled(resolution: Resolution, factor: float) -> Resolution:
-    """``resolution`` with every count of nodes, directions and moments multiplied (those of ``UNSCALED`` excepted)."""
+def scaled(resolution: Any, factor: float) -> Any:
+    """``resolution`` with every count of nodes, directions and moments multiplied, also in what it holds (those of
+    ``UNSCALED`` excepted)."""
 
     def times(value: Any) -> Any:
+        if is_dataclass(value):
+            return scaled(value, factor)
         if isinstance(value, tuple):
             return tuple(times(v) for v in value)
-        return max(min(value, FEWEST), round(factor * value))
+        if isinstance(value, int) and not isinstance(value, bool):
+            return max(min(value, FEWEST), round(factor * value))
+        return value
 
-    counts = {f.name: getattr(resolution, f.name) for f in fields(resolution)}
-    whole = {k: v for k, v in counts.items() if k not in UNSCALED and _is_count(v)}
-    return replace(resolution, **{name: times(value) for name, value in whole.items()})
-
-
-def _is_count(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return all(_is_count(v) for v in value)
-    return isinstance(value, int) and not isinstance(value, bool)
+    names = (f.name for f in fields(resolution) if f.name not in UNSCALED)
+    return replace(resolution, **{name: times(getattr(resolution, name)) for name in names})
 
 
 def number_in(setting: str, kind: str) -> float:

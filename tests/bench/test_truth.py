@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -86,6 +88,21 @@ def test_scaled_resolutions():
     assert (half.altitudes, twice.altitudes) == (base.altitudes // 2, 2 * base.altitudes)
     assert twice.orders == base.orders and twice.first_suns == base.first_suns
     assert scaled(base, 1e-3).suns == 4
+
+
+def test_scaled_resolutions_inside_others():
+    @dataclass(frozen=True)
+    class Inner:
+        degree: int = 6
+        exact: bool = True
+
+    @dataclass(frozen=True)
+    class Outer:
+        orders: int = 40
+        stages: tuple = (Inner(), Inner(8, False))
+        power: float = 2.5
+
+    assert scaled(Outer(), 2.0) == Outer(40, (Inner(12), Inner(16, False)), 2.5)
 
 
 @pytest.mark.parametrize("setting", ["", "tolerance", "tolerance x", "tolerance -1", "times 1", "tolerance 0"])
