@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,7 +48,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
                 label=method,
             )
             for x, y, text in zip(seconds, errors, settings, strict=True):
-                panel.annotate(text.split()[-1], (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
+                panel.annotate(_number(text), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
         panel.set_title(TITLES[group], fontsize=9)
         panel.set_xscale("log")
         panel.set_yscale("log")
@@ -57,10 +58,15 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     for panel in panels:
         handles |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles) or 1, fontsize=8)
-    figure.supxlabel("CPU seconds: solve (peers without one: all rays of an atmosphere)", fontsize=9)
+    panels[4].set_xlabel("CPU seconds: solve (peers without one: all rays of an atmosphere)", fontsize=9)
     figure.supylabel("error of radiance, 95th percentile, per cent", fontsize=9)
     figure.suptitle(f"Run time against error; truth: {result['truth']}", fontsize=10)
     figure.savefig(path, format="png", dpi=110, metadata={"Software": None})
+
+
+def _number(setting: str) -> str:
+    """The numbers of a setting: "16 streams, 9 suns" -> "16, 9"."""
+    return ", ".join(re.findall(r"[0-9.]*[0-9]", setting))
 
 
 def _points(result: Mapping[str, Any], group: str) -> dict[str, list[tuple[float, float, str]]]:

@@ -1,7 +1,8 @@
 """Markdown of a measured frontier, and its summary for the terminal.
 
 ``python -m bench.frontier_page BENCH.json docs/frontier.md`` writes the page of the documentation from the JSON of
-``atmo-jit bench``, and its picture beside it under ``images/``.
+``atmo-jit bench``, and its picture beside it under ``images/``. With several JSON files the parts of later ones (from
+``atmo-jit bench --part``) replace those of the first.
 """
 
 from __future__ import annotations
@@ -17,21 +18,26 @@ from .truth import GROUPS
 
 HEAD = """# Run time against error
 
-Printed by `atmo-jit bench --out DIR` (atmo-jit {atmo_jit}; {seconds:.0f} s on {cores} cores of a shared {processor}, of
-which {threads} threads are used) and `python -m bench.frontier_page DIR/bench.json docs/frontier.md`. Other programs
-run on this machine: wall seconds say less than CPU seconds.
+Printed by `atmo-jit bench --out DIR` (atmo-jit {atmo_jit}; {seconds:.0f} s) and
+`python -m bench.frontier_page DIR/bench.json docs/frontier.md`, on {cores} cores of a shared machine ({processor}).
+Other programs ran on it: wall seconds say less than CPU seconds.
 """
 FRONTIER = """## Every method and setting
 
-Errors are 95th percentiles in per cent, raw, against {truth}. Seconds are those of a solve of `{atmosphere}`, all
-suns, altitudes and directions at once: "warm" is the median of repeated solves in a process, "cached" the first solve
-of a process beyond imports with a full kernel cache, "cold" with an empty one.
+Errors are 95th percentiles in per cent, raw, against {truth}. Seconds are those of a
+solve of `{atmosphere}`, all suns, altitudes and directions at once: "warm" is the median of repeated solves in a
+process, "cached" the first solve of a process beyond imports with a full kernel cache, "cold" with an empty one.
+
+`bruneton2017` and `hillaire2020` are twins written from the papers (`bench/bruneton.py`, `bench/hillaire.py`); single
+scattering, transmittance and the sun on the ground are this package's for all methods, so that errors are those of
+multiple scattering. The tests compare the first, at full size, with texels of the published implementation.
 """
 BEYOND = """### Beyond the noise
 
 The same rays; 95th percentile and maximum of what exceeds three standard deviations of the reference, in per cent.
 """
-FEW = """Slow methods were asked for these atmospheres only: {cases}. On them atmo-jit at its default tolerance has:
+FEW = """Slow methods were asked for some atmospheres only: {cases}.
+On them atmo-jit at its default tolerance has:
 """
 STAGES = """## Stages
 
@@ -198,13 +204,18 @@ def _short(value: Any) -> str:
 
 def main(arguments: list[str]) -> int:
     """Command line."""
-    if len(arguments) != 2:
-        print("usage: python -m bench.frontier_page BENCH.json PAGE.md", file=sys.stderr)
+    if len(arguments) < 2:
+        print("usage: python -m bench.frontier_page BENCH.json [MORE.json ...] PAGE.md", file=sys.stderr)
         return 2
     from .figure import draw
 
-    result = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
-    target = Path(arguments[1])
+    *sources, page_name = arguments
+    result, *more = (json.loads(Path(source).read_text(encoding="utf-8")) for source in sources)
+    for later in more:
+        result |= {part: later[part] for part in ("frontier", "own_on_few", "peers", "curves") if part in later}
+        # Stages are measured against the limits of the same run.
+        result |= {part: later[part] for part in ("stages", "machine") if "stages" in later}
+    target = Path(page_name)
     picture = target.parent / "images" / f"{target.stem}.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw(result, picture)

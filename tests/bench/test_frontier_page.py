@@ -77,3 +77,8 @@ def test_the_page_of_the_documentation(result, tmp_path):
     assert "](images/frontier.png)" in (tmp_path / "frontier.md").read_text()
     assert (tmp_path / "images" / "frontier.png").is_file()
     assert frontier_page.main([]) == 2
+    (tmp_path / "more.json").write_text(json.dumps({"peers": [], "machine": {}, "truth": "other"}))
+    names = ("bench.json", "more.json", "frontier.md")
+    assert frontier_page.main([str(tmp_path / name) for name in names]) == 0
+    text = (tmp_path / "frontier.md").read_text()
+    assert "sasktran2" not in text and "made up" in text and "| a > b |" in text
