@@ -33,6 +33,11 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
+    few = {
+        row["method"]: f" ({len(row['cases'])} atmospheres)"
+        for row in result.get("frontier", ())
+        if row["cases"] != "all"
+    }
     panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     for panel, group in zip(panels, GROUPS, strict=True):
         for method, points in _points(result, group).items():
@@ -45,7 +50,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
                 markersize=5 if own else 3.5,
                 linewidth=2 if own else 1,
                 color=COLOURS.get(method),
-                label=method,
+                label=method + few.get(method, ""),
             )
             for x, y, text in zip(seconds, errors, settings, strict=True):
                 panel.annotate(_number(text), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
