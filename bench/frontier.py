@@ -41,7 +41,7 @@ from .truth import FEW_CASES, Truth
 SCHEMA = 2
 PARTS = ("frontier", "stages", "peers", "curves")
 # What --quick keeps: the settings that say most, and what takes seconds.
-QUICK = {"atmo-jit": ("tolerance 0.1", "tolerance 0.01"), "hillaire2020": ("size 1",)}
+QUICK = {"atmo-jit": ("tolerance 0.01",), "hillaire2020": ("size 1",)}
 Advance = Callable[[float], None]
 
 
