@@ -27,6 +27,7 @@ def no_reference(monkeypatch, tmp_path):
     monkeypatch.setattr(reference, "FOLDER", tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 def test_frontier_without_reference(run, tmp_path, no_reference):
     out = tmp_path / "bench"
     status, text, err = run("--out", out, "--quick", "--part", "frontier", "--method", "hillaire2020")
