@@ -93,8 +93,7 @@ def loop_sizes(resolution: Resolution, orders: int) -> dict[str, float]:
     ``beam``: sunlight along the paths; ``project``: moments of order 1; ``gather``, ``contract``: the later orders.
     """
     r = resolution
-    # The last stage serves most orders.
-    later = getattr(r, "stages", (r,))[-1]
+    later = last_stage(r)
     first_nodes = r.altitudes * (r.first_up + r.first_down) * r.suns * r.first_suns
     paths = r.altitudes * (later.up + later.down) * r.altitudes
     gathers = max(orders - 1, 0)
@@ -105,6 +104,11 @@ def loop_sizes(resolution: Resolution, orders: int) -> dict[str, float]:
         "gather": gathers * paths * r.suns * later.azimuths * (later.degree + 1),
         "contract": gathers * paths * r.suns * pair_count(later.degree),
     }
+
+
+def last_stage(resolution: Resolution) -> Any:
+    """Directions, azimuths and degree of most orders: the last of the resolution's stages, where it has several."""
+    return getattr(resolution, "stages", (resolution,))[-1]
 
 
 def table_mib(resolution: Resolution, channels: int) -> float:
