@@ -248,8 +248,8 @@ def test_planned_results_are_those_of_everything_built(name):
     planned = plan(description, Needs.of_views(description, views), tolerance=0.03)
     found = radiance(planned.solve(), views)
     truth = everything(description, views, tolerance=0.03)
-    # Nothing times anything is nothing, also in single precision; the compiler may order the sums differently.
-    assert largest_difference(found, truth) < 1e-6
+    # Nothing times anything is nothing; what may differ is the rounding (6e-8 each) of sums of some hundred terms.
+    assert largest_difference(found, truth) < 2e-5
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
