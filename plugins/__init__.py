@@ -19,6 +19,7 @@ __all__ = ["PLUGINS", "register"]
 # Plugin: its kind and base class in Mitsuba, the module here and the class in it.
 PLUGINS = {
     "atmosphere": ("emitter", "Emitter", "emitter", "AtmosphereEmitter"),
+    "atmosphere_needs": ("emitter", "Emitter", "needs", "AtmosphereNeeds"),
     "atmosphere_sun": ("emitter", "Emitter", "reference", "AtmosphereSun"),
     "atmosphere_volpath": ("integrator", "SamplingIntegrator", "volpath", "AtmosphereVolpath"),
     "atmosphere_medium": ("medium", "Medium", "medium", "AtmosphereMedium"),

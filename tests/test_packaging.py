@@ -26,7 +26,7 @@ def files_below(folder):
 
 def test_every_package_is_installed_and_nothing_else():
     listed = {folder_of(package) for package in PROJECT["tool"]["setuptools"]["packages"]}
-    tops = [ROOT / name for name in ("atmo_jit", "fits", "plugins", "scenes")]
+    tops = [ROOT / name for name in ("atmo_jit", "bench", "fits", "plugins", "scenes")]
     assert listed == {file.parent for top in tops for file in files_below(top)}
     assert all(name.partition(".")[0] == "atmo_jit" for name in PROJECT["tool"]["setuptools"]["packages"])
 
