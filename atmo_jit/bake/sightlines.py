@@ -1,0 +1,303 @@
+"""Many suns along shared view rays: what all tables are filled with.
+
+A table asks for the same view rays again and again, under other suns. What a ray scatters toward its origin, density
+times transmittance at the nodes of a quadrature, has no sun in it: :class:`Sightlines` computes it once, in double
+precision, and :meth:`Sightlines.light` then sums sunlight and the solved field over those nodes for any number of
+suns. Single scattering comes per constituent and without its phase function, which varies too fast to be
+interpolated.
+
+Two approximations set this apart from the march of ``Sky.rays``. Direct sunlight at a node is interpolated in a table
+over altitude and sun cosine. Pieces are not cut at the planet's shadow; instead the sun's visible part is averaged
+over the stretch that a node stands for. ``python -m bench.tables`` prints what both cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..backend import floats, packet, padded, parameter, stored, types, uints
+from ..column import SunColumns
+from ..geometry import safe_sine
+from ..march import relative_azimuth
+from ..optics import Optics
+from ..quadrature import gauss_legendre, running_integral
+from ..single_scattering import horizontal_irradiance
+
+NODES = 3  # Gauss-Legendre nodes per piece
+MAX_DEPTH = 1.0  # optical depth of a piece
+SPENT_DEPTH = 16.0  # what lies behind 1e-7 of transmittance is not seen
+LONGEST = 32  # pieces into which one shell is cut at most
+SUNLIGHT = (96, 320)  # altitudes, sun cosines
+
+
+@dataclass
+class Parts:
+    """Light toward the origin of rays: lists of Dr.Jit Floats.
+
+    ``single[k][c]``: single scattering by the scatterer k at channel c without its phase function; ``multiple[c]``:
+    all further orders; ``ground[c]``: the ground's own radiance behind the air.
+    """
+
+    single: list[list[Any]]
+    multiple: list[Any]
+    ground: list[Any]
+
+
+class Sunlight:
+    """Transmittance from altitude toward the sun: rows even in the square root of altitude, columns even in
+    sqrt((mu_s - horizon) / (1 - horizon)), so that both crowd where it changes."""
+
+    def __init__(self, optics: Optics, columns: SunColumns, size: tuple[int, int] = SUNLIGHT) -> None:
+        t = types()
+        self.rows, self.cosines = size
+        self.size = padded(optics.channel_count)
+        lane = dr.arange(t.UInt, self.rows * self.cosines)
+        y, x = (t.Float(i) / parameter(n - 1.0) for i, n in ((lane // self.cosines, size[0]), (lane % size[1], size[1])))
+        h = optics.thickness * y * y
+        horizon = -dr.sqrt(h * (2.0 * optics.radius + h)) / (optics.radius + h)
+        depths = optics.optical_depths(columns.toward(h, dr.fma(1.0 - horizon, x * x, horizon)))
+        self.table = stored([dr.exp(-d) for d in depths], lane, self.size)
+
+    def at(self, row: Any, x: Any) -> list[Any]:
+        """Per channel (and padding), at a fractional row and at sqrt((mu_s - horizon) / (1 - horizon))."""
+        t = types()
+        x = dr.minimum(x, 1.0) * (self.cosines - 1)
+        j, i = dr.minimum(t.Int(x), self.cosines - 2), dr.minimum(t.Int(row), self.rows - 2)
+        fx, fy = x - t.Float(j), row - t.Float(i)
+        corner = t.UInt(dr.fma(i, self.cosines, j))
+        a, b, c, d = (packet(self.table, corner + o, self.size) for o in (0, 1, self.cosines, self.cosines + 1))
+        return [dr.lerp(dr.lerp(p, q, fx), dr.lerp(r, s, fx), fy) for p, q, r, s in zip(a, b, c, d, strict=True)]
+
+
+class Sightlines:
+    """View rays of one band, from altitude ``h`` (m, also above the air) at zenith cosine ``mu``, between the
+    distances ``start`` and ``stop`` (m; by default from the observer to the ground or out of the air).
+
+    All arguments are float64 arrays [R]. Attributes, [R] or [R, ...]: ``start``, ``stop``; ``ground``: the ray ends
+    there; ``transmittance`` [R, C]; ``scattering`` [R, K, C]: integral of scattering coefficient times transmittance
+    along the ray, for every scatterer.
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        h: np.ndarray,
+        mu: np.ndarray,
+        start: np.ndarray | None = None,
+        stop: np.ndarray | None = None,
+        nodes: int = NODES,
+    ) -> None:
+        self.optics, self.mu = optics, mu
+        radius, top = optics.atmosphere.bottom_radius_m, optics.atmosphere.top_radius_m
+        r = radius + h
+        self.r = r
+        # Altitude first, as in geometry.py: b is the ray's least distance from the centre, on its whole line.
+        sine = np.sqrt((1.0 - mu) * (1.0 + mu))
+        middle = -r * mu  # distance to the perigee
+        levels = optics.breaks_m
+        lowest = h - r * mu * mu / (1.0 + sine)
+        half = np.sqrt(np.maximum((levels - lowest[:, None]) * (2.0 * radius + levels + lowest[:, None]), 0.0))
+        falls = (mu < 0.0) & (h > 0.0) | (mu < 0.0)
+        meets = half[:, -1] > 0.0
+        hits = falls & (lowest < 0.0) & (h >= 0.0)
+        end = np.where(hits, np.maximum(middle - half[:, 0], 0.0), middle + half[:, -1])
+        begin = np.maximum(middle - half[:, -1], 0.0) if np.any(r > top) else np.zeros_like(h)
+        end = np.where(meets & (end > begin), end, begin)
+        self.start = begin if start is None else np.clip(start, begin, end)
+        self.stop = end if stop is None else np.clip(stop, self.start, end)
+        self.ground = hits & (self.stop >= end) & (end >= begin)
+        # Shells passed on the way down, from the top on, then those on the way up.
+        near = np.concatenate([middle[:, None] - half[:, :0:-1], middle[:, None] + half[:, :-1]], axis=1)
+        far = np.concatenate([middle[:, None] - half[:, -2::-1], middle[:, None] + half[:, 1:]], axis=1)
+        near, far = (np.clip(d, self.start[:, None], self.stop[:, None]) for d in (near, far))
+        ray, shell = np.nonzero(far > near)
+        self._cut(sine, ray, near[ray, shell], far[ray, shell], nodes)
+
+    def _cut(self, sine: np.ndarray, ray: np.ndarray, near: np.ndarray, far: np.ndarray, nodes: int) -> None:
+        """Pieces thin enough for the quadrature; columns from the start of each ray; weights at the nodes."""
+        optics = self.optics
+        scattering, extinction = _coefficients(optics)
+        few_x, few_w = gauss_legendre(4)
+        density = self._densities(ray, near + (far - near) * few_x[:, None])  # [constituent, node, piece]
+        column = np.einsum("g,kgp->kp", few_w, density) * (far - near)
+        depth = (extinction.T @ column).max(axis=0, initial=0.0)
+        parts = np.clip(np.ceil(depth / MAX_DEPTH), 1, LONGEST).astype(int)
+        which = np.repeat(np.arange(len(ray)), parts)
+        place = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
+        step = (far - near)[which] / parts[which]
+        ray, near = ray[which], near[which] + place * step
+
+        density = self._densities(ray, near + step * few_x[:, None])
+        column = np.einsum("g,kgp->kp", few_w, density) * step
+        before = np.cumsum(column, axis=1) - column
+        first = np.searchsorted(ray, np.arange(len(self.mu)))
+        from_start = before - before[:, np.minimum(first, len(ray) - 1)][:, ray] if len(ray) else before
+        total = np.zeros((len(column), len(self.mu)))
+        np.add.at(total.T, ray, column.T)
+        self.transmittance = np.exp(-(extinction.T @ total)).T
+        seen = (extinction.T @ from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
+        ray, near, step, from_start, density = ray[seen], near[seen], step[seen], from_start[:, seen], density[..., seen]
+
+        x, w = gauss_legendre(nodes)
+        inner = from_start[:, None] + np.einsum("gf,kfp->kgp", running_integral(4, tuple(x)), density) * step
+        distance = near + step * x[:, None]
+        here = self._densities(ray, distance)
+        through = np.exp(-np.einsum("kc,kgp->gpc", extinction, inner)) * (w[:, None] * step)[..., None]
+        weight = np.einsum("kc,kgp,gpc->pgkc", scattering, here[optics.scatterers], through)
+        self.scattering = np.zeros((len(self.mu), *weight.shape[2:]))
+        np.add.at(self.scattering, ray, weight.sum(axis=1))
+        by_piece = weight.sum(axis=1)
+        share = weight.sum(axis=(2, 3))
+        whole = share.sum(axis=1)
+        lit = whole > 0.0
+        middle = np.where(lit, (share * distance.T).sum(axis=1) / np.where(lit, whole, 1.0), near + 0.5 * step)
+        self._nodes = self._table(sine, np.repeat(ray, nodes), distance.T.ravel(), np.repeat(0.5 * step / nodes, nodes))
+        self._weights = _padded_channels(weight.reshape(-1, *weight.shape[2:]))
+        self._pieces = self._table(sine, ray, middle, 0.5 * step)
+        self._piece_weights = _padded_channels(by_piece)
+        bounds = np.searchsorted(ray, np.arange(len(self.mu) + 1))
+        self._first_piece, self._first_node = uints(bounds), uints(bounds * nodes)
+        end = self._altitude(np.arange(len(self.mu)), self.stop)[1]
+        self._ends = floats(
+            np.column_stack([(self.r + self.stop * self.mu) / end, self.stop * sine / end, sine, self.mu])
+        )
+        through = np.where(self.ground[:, None], self.transmittance, 0.0)
+        self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
+
+    def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Altitude and radius (m) of points on rays, [..., len(ray)]."""
+        r, mu = self.r[ray], self.mu[ray]
+        there = np.sqrt(np.maximum(r * r + distance * (2.0 * r * mu + distance), 0.0))
+        return np.maximum(there - self.optics.atmosphere.bottom_radius_m, 0.0), there
+
+    def _densities(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        h, _ = self._altitude(ray, distance)
+        return np.array([np.asarray(c.profile.density(h)) for c in self.optics.constituents]).reshape(-1, *h.shape)
+
+    def _table(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
+        """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's
+        centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in cosines."""
+        atmosphere = self.optics.atmosphere
+        h, r = self._altitude(ray, distance)
+        horizon = -np.sqrt(h * (2.0 * atmosphere.bottom_radius_m + h)) / r
+        disc = np.maximum(np.deg2rad(atmosphere.sun_angular_radius_deg) * atmosphere.bottom_radius_m / r, 1e-7)
+        return floats(
+            np.column_stack(
+                [
+                    np.sqrt(np.clip(h / atmosphere.thickness_m, 0.0, 1.0)) * (SUNLIGHT[0] - 1),
+                    horizon,
+                    1.0 / (1.0 - horizon),
+                    (self.r[ray] + distance * self.mu[ray]) / r,
+                    distance * sine[ray] / r,
+                    np.clip((self.r[ray] * self.mu[ray] + distance) / r, -1.0, 1.0),
+                    half / r,
+                    disc,
+                ]
+            )
+        )
+
+    def light(self, sunlight: Sunlight, band: Any, ray: Any, mu_s: Any, across: Any, *, ground: bool = True) -> Parts:
+        """Light along the rays ``ray`` (UInt indices) under suns at zenith cosine ``mu_s`` at the observer.
+
+        ``across`` = sin(sun zenith) cos(azimuth of the view from the sun). Evaluated.
+        """
+        turn = packet(self._ends, ray, 4)
+        nu = dr.clip(dr.fma(turn[3], mu_s, turn[2] * across), -1.0, 1.0)
+        dr.eval(ray, mu_s, across, nu)
+        single = self.single(sunlight, ray, mu_s, across, nu)
+        channels = range(self.optics.channel_count)
+        multiple = [dr.zeros(types().Float, dr.width(ray)) for _ in channels]
+        if band.source is not None:
+            multiple = self.multiple(band.source, ray, mu_s, across, nu)
+        glow = [dr.zeros(types().Float, dr.width(ray)) for _ in channels]
+        if ground and np.any(self.ground):
+            glow = self._ground(band, ray, mu_s, across)
+        return Parts(single, multiple, glow)
+
+    def single(self, sunlight: Sunlight, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
+        """Single scattering without phase functions, [scatterer][channel], evaluated."""
+        t = types()
+        kinds, channels, size = len(self.optics.scatterers), self.optics.channel_count, sunlight.size
+        solar = self.optics.solar
+
+        def node(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            row, horizon, scale, cos_turn, sin_turn, mu, half, disc = packet(self._nodes, i, 8)
+            there = dr.fma(cos_turn, mu_s, sin_turn * across)
+            above = there - horizon
+            width = dr.maximum(disc, dr.abs(dr.fma(-there, mu, nu)) * half)
+            x = dr.clip(dr.fma(0.5, above / width, 0.5), 0.0, 1.0)
+            seen = x * x * dr.fma(-2.0, x, 3.0)
+            light = sunlight.at(row, dr.sqrt(dr.maximum(above * scale, 0.0)))
+            weight = packet(self._weights, i, kinds * size)
+            for n in range(kinds):
+                for c in range(channels):
+                    sums[n * channels + c] = dr.fma(weight[n * size + c] * seen, light[c], sums[n * channels + c])
+            return i + 1, sums
+
+        sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
+        if kinds:
+            start, end = (dr.gather(t.UInt, self._first_node, ray + o) for o in (0, 1))
+            _, sums = dr.while_loop((start, sums), lambda i, _: i < end, node, label="sightlines: single")
+        single = [[sums[n * channels + c] * solar[c] for c in range(channels)] for n in range(kinds)]
+        dr.eval(single)
+        return single
+
+    def multiple(self, source: Any, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[Any]:
+        """Radiance of all orders after the first, per channel, evaluated: the field, asked once per piece."""
+        t = types()
+        kinds, channels, size = (
+            len(self.optics.scatterers),
+            self.optics.channel_count,
+            padded(self.optics.channel_count),
+        )
+        per_row = self.optics.thickness / (SUNLIGHT[0] - 1.0) ** 2
+
+        def piece(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._pieces, i, 8)
+            there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
+            toward = source.scattered(row * row * per_row, there, mu, relative_azimuth(mu, there, nu), True)
+            weight = packet(self._piece_weights, i, kinds * size)
+            for n in range(kinds):
+                for c in range(channels):
+                    sums[c] = dr.fma(weight[n * size + c], toward[n][c], sums[c])
+            return i + 1, sums
+
+        sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(channels)]
+        start, end = (dr.gather(t.UInt, self._first_piece, ray + o) for o in (0, 1))
+        _, sums = dr.while_loop((start, sums), lambda i, _: i < end, piece, label="sightlines: multiple")
+        dr.eval(sums)
+        return sums
+
+    def _ground(self, band: Any, ray: Any, mu_s: Any, across: Any) -> list[Any]:
+        cos_turn, sin_turn, _, _ = packet(self._ends, ray, 4)
+        there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
+        h = dr.zeros(types().Float, dr.width(ray))
+        dr.make_opaque(h, there)
+        sun, sky = horizontal_irradiance(self.optics, band.columns, band.field, h, there, reflected=True)
+        through = packet(self._through, ray, padded(self.optics.channel_count))
+        glow = [
+            through[c] * albedo * dr.inv_pi * (sun[c] + sky[c]) for c, albedo in enumerate(self.optics.albedo)
+        ]
+        dr.eval(glow)
+        return glow
+
+
+def _coefficients(optics: Optics) -> tuple[np.ndarray, np.ndarray]:
+    """Scattering [scatterer, channel] and extinction [constituent, channel], 1/m."""
+    count = optics.channel_count
+    scattering = [optics.constituents[k].scattering_per_m[optics.indices] for k in optics.scatterers]
+    extinction = [c.extinction_per_m[optics.indices] for c in optics.constituents]
+    return np.array(scattering).reshape(-1, count), np.array(extinction).reshape(-1, count)
+
+
+def _padded_channels(values: np.ndarray) -> Any:
+    """[rows, scatterers, channels] as a buffer with channels padded for packet loads."""
+    extra = padded(values.shape[-1]) - values.shape[-1]
+    return floats(np.pad(values, ((0, 0), (0, 0), (0, extra))))
+
+
+__all__ = ["Parts", "Sightlines", "Sunlight", "safe_sine"]
