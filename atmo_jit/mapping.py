@@ -300,6 +300,22 @@ def half_azimuth_inverse(x: Any) -> Any:
     return 1.0 - 2.0 * x * x
 
 
+def twilight_sun(mu_s: Any, lowest: float, steepness: float) -> Any:
+    """x = (atan(k mu_s) - atan(k lowest)) / (atan(k) - atan(k lowest)): suns crowd about the horizontal, from ``lowest``
+    (0) to the zenith (1).
+
+    The form of B08's map for mu_s; the steepness k is a parameter here.
+    """
+    start = math.atan(steepness * lowest)
+    return (_atan(steepness * mu_s) - start) / (math.atan(steepness) - start)
+
+
+def twilight_sun_inverse(x: Any, lowest: float, steepness: float) -> Any:
+    """mu_s."""
+    start = math.atan(steepness * lowest)
+    return _clip(module_of(x).tan(start + x * (math.atan(steepness) - start)) / steepness, -1.0, 1.0)
+
+
 def _split_power(mu: Any, edge: Any, power: float) -> Any:
     above = mu >= edge
     reach = _where(above, 1.0 - edge, 1.0 + edge)
@@ -342,3 +358,8 @@ def _clip(x: Any, low: float, high: float) -> Any:
 def _acos(x: Any) -> Any:
     xp = module_of(x)
     return np.arccos(x) if xp is np else xp.acos(x)
+
+
+def _atan(x: Any) -> Any:
+    xp = module_of(x)
+    return np.arctan(x) if xp is np else xp.atan(x)

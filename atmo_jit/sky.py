@@ -76,6 +76,11 @@ class Sky:
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
         self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance) for band in bands]
 
+    @property
+    def bands(self) -> list[_Band]:
+        """The solution at up to four wavelengths each: what tables are baked from."""
+        return self._bands
+
     def rays(
         self,
         altitude_m: Any,
@@ -94,7 +99,7 @@ class Sky:
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun).
         """
-        rays, meets_air, passes = self._enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
+        rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
         for band in self._bands:
@@ -127,8 +132,8 @@ class Sky:
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky
 
-    def _enter(
-        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any
+    def enter(
+        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any = None
     ) -> tuple[Rays, Any, Any]:
         """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether
         they leave for space."""

@@ -2,8 +2,8 @@
 
 A table asks for the same view rays again and again, under other suns. What a ray scatters toward its origin, density
 times transmittance at the nodes of a quadrature, has no sun in it: :class:`Sightlines` computes it once, in double
-precision, and :meth:`Sightlines.light` then sums sunlight and the solved field over those nodes for any number of
-suns. Single scattering comes per constituent and without its phase function, which varies too fast to be
+precision, and :meth:`Sightlines.single` and :meth:`Sightlines.multiple` then sum sunlight and the solved field over
+those nodes for any number of suns. Single scattering comes per constituent and without its phase function, which varies too fast to be
 interpolated.
 
 Two approximations set this apart from the march of ``Sky.rays``. Direct sunlight at a node is interpolated in a table
@@ -13,15 +13,13 @@ over the stretch that a node stands for. ``python -m bench.tables`` prints what 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ..backend import floats, packet, padded, parameter, stored, types, uints
+from ..backend import floats, packet, padded, stored, types, uints
 from ..column import SunColumns
-from ..geometry import safe_sine
 from ..march import relative_azimuth
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
@@ -34,19 +32,6 @@ LONGEST = 32  # pieces into which one shell is cut at most
 SUNLIGHT = (96, 320)  # altitudes, sun cosines
 
 
-@dataclass
-class Parts:
-    """Light toward the origin of rays: lists of Dr.Jit Floats.
-
-    ``single[k][c]``: single scattering by the scatterer k at channel c without its phase function; ``multiple[c]``:
-    all further orders; ``ground[c]``: the ground's own radiance behind the air.
-    """
-
-    single: list[list[Any]]
-    multiple: list[Any]
-    ground: list[Any]
-
-
 class Sunlight:
     """Transmittance from altitude toward the sun: rows even in the square root of altitude, columns even in
     sqrt((mu_s - horizon) / (1 - horizon)), so that both crowd where it changes."""
@@ -56,7 +41,7 @@ class Sunlight:
         self.rows, self.cosines = size
         self.size = padded(optics.channel_count)
         lane = dr.arange(t.UInt, self.rows * self.cosines)
-        y, x = (t.Float(i) / parameter(n - 1.0) for i, n in ((lane // self.cosines, size[0]), (lane % size[1], size[1])))
+        y, x = t.Float(lane // self.cosines) / (self.rows - 1.0), t.Float(lane % self.cosines) / (self.cosines - 1.0)
         h = optics.thickness * y * y
         horizon = -dr.sqrt(h * (2.0 * optics.radius + h)) / (optics.radius + h)
         depths = optics.optical_depths(columns.toward(h, dr.fma(1.0 - horizon, x * x, horizon)))
@@ -77,7 +62,9 @@ class Sightlines:
     """View rays of one band, from altitude ``h`` (m, also above the air) at zenith cosine ``mu``, between the
     distances ``start`` and ``stop`` (m; by default from the observer to the ground or out of the air).
 
-    All arguments are float64 arrays [R]. Attributes, [R] or [R, ...]: ``start``, ``stop``; ``ground``: the ray ends
+    ``stretches``: the field of later orders is asked once in about so many parts of a ray (0: in every piece).
+    ``ground``: which rays meet the ground, where rounding must not decide it (the horizon itself). All arguments are
+    float64 arrays [R]. Attributes, [R] or [R, ...]: ``start``, ``stop``; ``ground``: the ray ends
     there; ``transmittance`` [R, C]; ``scattering`` [R, K, C]: integral of scattering coefficient times transmittance
     along the ray, for every scatterer.
     """
@@ -89,9 +76,11 @@ class Sightlines:
         mu: np.ndarray,
         start: np.ndarray | None = None,
         stop: np.ndarray | None = None,
+        ground: np.ndarray | bool | None = None,
+        stretches: int = 0,
         nodes: int = NODES,
     ) -> None:
-        self.optics, self.mu = optics, mu
+        self.optics, self.mu, self._parts = optics, mu, stretches
         radius, top = optics.atmosphere.bottom_radius_m, optics.atmosphere.top_radius_m
         r = radius + h
         self.r = r
@@ -101,9 +90,8 @@ class Sightlines:
         levels = optics.breaks_m
         lowest = h - r * mu * mu / (1.0 + sine)
         half = np.sqrt(np.maximum((levels - lowest[:, None]) * (2.0 * radius + levels + lowest[:, None]), 0.0))
-        falls = (mu < 0.0) & (h > 0.0) | (mu < 0.0)
         meets = half[:, -1] > 0.0
-        hits = falls & (lowest < 0.0) & (h >= 0.0)
+        hits = (mu < 0.0) & (lowest < 0.0) if ground is None else np.broadcast_to(ground, mu.shape)
         end = np.where(hits, np.maximum(middle - half[:, 0], 0.0), middle + half[:, -1])
         begin = np.maximum(middle - half[:, -1], 0.0) if np.any(r > top) else np.zeros_like(h)
         end = np.where(meets & (end > begin), end, begin)
@@ -150,23 +138,38 @@ class Sightlines:
         weight = np.einsum("kc,kgp,gpc->pgkc", scattering, here[optics.scatterers], through)
         self.scattering = np.zeros((len(self.mu), *weight.shape[2:]))
         np.add.at(self.scattering, ray, weight.sum(axis=1))
-        by_piece = weight.sum(axis=1)
-        share = weight.sum(axis=(2, 3))
-        whole = share.sum(axis=1)
-        lit = whole > 0.0
-        middle = np.where(lit, (share * distance.T).sum(axis=1) / np.where(lit, whole, 1.0), near + 0.5 * step)
+        self._gather_stretches(sine, ray, distance.T, weight)
         self._nodes = self._table(sine, np.repeat(ray, nodes), distance.T.ravel(), np.repeat(0.5 * step / nodes, nodes))
         self._weights = _padded_channels(weight.reshape(-1, *weight.shape[2:]))
-        self._pieces = self._table(sine, ray, middle, 0.5 * step)
-        self._piece_weights = _padded_channels(by_piece)
-        bounds = np.searchsorted(ray, np.arange(len(self.mu) + 1))
-        self._first_piece, self._first_node = uints(bounds), uints(bounds * nodes)
+        self._first_node = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)) * nodes)
         end = self._altitude(np.arange(len(self.mu)), self.stop)[1]
         self._ends = floats(
             np.column_stack([(self.r + self.stop * self.mu) / end, self.stop * sine / end, sine, self.mu])
         )
         through = np.where(self.ground[:, None], self.transmittance, 0.0)
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
+
+    def _gather_stretches(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
+        """Neighbouring pieces as stretches with about equal shares of what the ray scatters, and the centroid of each. ``distance`` [piece, node], ``weight`` [piece, node, scatterer, channel]."""
+        channels = np.maximum(self.scattering.sum(axis=1), 1e-300)
+        share = (weight.sum(axis=2) / channels[ray][:, None]).mean(axis=2)
+        by_piece = share.sum(axis=1)
+        sums = np.cumsum(by_piece) - 0.5 * by_piece
+        start = (np.cumsum(by_piece) - by_piece)[np.searchsorted(ray, ray)]
+        part = np.clip((sums - start) * self._parts, 0, max(self._parts - 1, 0)).astype(int)
+        rising = distance[:, 0] >= -(self.r * self.mu)[ray]
+        key = (ray * (self._parts + 1) + part) * 2 + rising if self._parts else np.arange(len(ray))
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        total = np.add.reduceat(by_piece, first) if len(first) else by_piece
+        moment = np.add.reduceat((share * distance).sum(axis=1), first) if len(first) else by_piece
+        ray = ray[first]
+        lit = total > 0.0
+        centre = np.where(lit, moment / np.where(lit, total, 1.0), distance[first, 0])
+        self._stretches = self._table(sine, ray, centre, np.zeros(len(first)))
+        self._stretch_weights = _padded_channels(
+            np.add.reduceat(weight.sum(axis=1), first) if len(first) else weight.sum(axis=1)
+        )
+        self._first_stretch = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)))
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Altitude and radius (m) of points on rays, [..., len(ray)]."""
@@ -200,23 +203,15 @@ class Sightlines:
             )
         )
 
-    def light(self, sunlight: Sunlight, band: Any, ray: Any, mu_s: Any, across: Any, *, ground: bool = True) -> Parts:
-        """Light along the rays ``ray`` (UInt indices) under suns at zenith cosine ``mu_s`` at the observer.
+    def nu(self, ray: Any, mu_s: Any, across: Any) -> Any:
+        """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``, evaluated.
 
-        ``across`` = sin(sun zenith) cos(azimuth of the view from the sun). Evaluated.
+        ``across`` = sin(sun zenith) cos(azimuth of the view from the sun), here and below.
         """
-        turn = packet(self._ends, ray, 4)
-        nu = dr.clip(dr.fma(turn[3], mu_s, turn[2] * across), -1.0, 1.0)
+        _, _, sine, mu = packet(self._ends, ray, 4)
+        nu = dr.clip(dr.fma(mu, mu_s, sine * across), -1.0, 1.0)
         dr.eval(ray, mu_s, across, nu)
-        single = self.single(sunlight, ray, mu_s, across, nu)
-        channels = range(self.optics.channel_count)
-        multiple = [dr.zeros(types().Float, dr.width(ray)) for _ in channels]
-        if band.source is not None:
-            multiple = self.multiple(band.source, ray, mu_s, across, nu)
-        glow = [dr.zeros(types().Float, dr.width(ray)) for _ in channels]
-        if ground and np.any(self.ground):
-            glow = self._ground(band, ray, mu_s, across)
-        return Parts(single, multiple, glow)
+        return nu
 
     def single(self, sunlight: Sunlight, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
         """Single scattering without phase functions, [scatterer][channel], evaluated."""
@@ -246,42 +241,39 @@ class Sightlines:
         dr.eval(single)
         return single
 
-    def multiple(self, source: Any, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[Any]:
-        """Radiance of all orders after the first, per channel, evaluated: the field, asked once per piece."""
+    def multiple(self, source: Any, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
+        """Radiance of all orders after the first by the scatterer that sent it here, [scatterer][channel], evaluated:
+        the field, asked once per stretch."""
         t = types()
-        kinds, channels, size = (
-            len(self.optics.scatterers),
-            self.optics.channel_count,
-            padded(self.optics.channel_count),
-        )
+        kinds, channels = len(self.optics.scatterers), self.optics.channel_count
+        size = padded(channels)
         per_row = self.optics.thickness / (SUNLIGHT[0] - 1.0) ** 2
 
-        def piece(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._pieces, i, 8)
+        def stretch(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
             there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
             toward = source.scattered(row * row * per_row, there, mu, relative_azimuth(mu, there, nu), True)
-            weight = packet(self._piece_weights, i, kinds * size)
+            weight = packet(self._stretch_weights, i, kinds * size)
             for n in range(kinds):
                 for c in range(channels):
-                    sums[c] = dr.fma(weight[n * size + c], toward[n][c], sums[c])
+                    sums[n * channels + c] = dr.fma(weight[n * size + c], toward[n][c], sums[n * channels + c])
             return i + 1, sums
 
-        sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(channels)]
-        start, end = (dr.gather(t.UInt, self._first_piece, ray + o) for o in (0, 1))
-        _, sums = dr.while_loop((start, sums), lambda i, _: i < end, piece, label="sightlines: multiple")
+        sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
+        start, end = (dr.gather(t.UInt, self._first_stretch, ray + o) for o in (0, 1))
+        _, sums = dr.while_loop((start, sums), lambda i, _: i < end, stretch, label="sightlines: multiple")
         dr.eval(sums)
-        return sums
+        return [sums[n * channels : (n + 1) * channels] for n in range(kinds)]
 
-    def _ground(self, band: Any, ray: Any, mu_s: Any, across: Any) -> list[Any]:
+    def ground_light(self, band: Any, ray: Any, mu_s: Any, across: Any) -> list[Any]:
+        """The ground's own radiance seen through the air, per channel, evaluated; 0 on rays that do not end there."""
         cos_turn, sin_turn, _, _ = packet(self._ends, ray, 4)
         there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
         h = dr.zeros(types().Float, dr.width(ray))
         dr.make_opaque(h, there)
         sun, sky = horizontal_irradiance(self.optics, band.columns, band.field, h, there, reflected=True)
         through = packet(self._through, ray, padded(self.optics.channel_count))
-        glow = [
-            through[c] * albedo * dr.inv_pi * (sun[c] + sky[c]) for c, albedo in enumerate(self.optics.albedo)
-        ]
+        glow = [through[c] * albedo * dr.inv_pi * (sun[c] + sky[c]) for c, albedo in enumerate(self.optics.albedo)]
         dr.eval(glow)
         return glow
 
@@ -298,6 +290,3 @@ def _padded_channels(values: np.ndarray) -> Any:
     """[rows, scatterers, channels] as a buffer with channels padded for packet loads."""
     extra = padded(values.shape[-1]) - values.shape[-1]
     return floats(np.pad(values, ((0, 0), (0, 0), (0, extra))))
-
-
-__all__ = ["Parts", "Sightlines", "Sunlight", "safe_sine"]
