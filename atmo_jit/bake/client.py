@@ -71,7 +71,9 @@ def bruneton_tables(sky: Sky, mu_s_min: float = -0.5, size: tuple[int, int, int,
     _, diffuse = sky.irradiance(h.ravel(), np.arccos(mu_s).ravel())
     irradiance = np.stack([e.numpy() for e in diffuse], axis=-1).reshape(*IRRADIANCE, -1)
     parts = [_scattering(band, to, size) for band in sky.bands]
-    return BrunetonTables(to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True)))
+    return BrunetonTables(
+        to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
+    )
 
 
 def transmittance_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[np.ndarray]:
@@ -79,7 +81,9 @@ def transmittance_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[np.ndar
     perigee and rise again."""
     if not optics.constituents:
         return [np.ones(len(h), dtype=np.float32)] * optics.channel_count
-    lowest = np.maximum(h - (optics.atmosphere.bottom_radius_m + h) * mu * mu / (1.0 + np.sqrt((1 - mu) * (1 + mu))), 0.0)
+    lowest = np.maximum(
+        h - (optics.atmosphere.bottom_radius_m + h) * mu * mu / (1.0 + np.sqrt((1 - mu) * (1 + mu))), 0.0
+    )
     columns = column_up(optics, floats(h), floats(np.abs(mu)))
     whole = column_up(optics, floats(lowest), dr.zeros(types().Float, len(h)))
     falls = floats(mu) < 0.0

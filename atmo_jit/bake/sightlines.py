@@ -128,7 +128,13 @@ class Sightlines:
         np.add.at(total.T, ray, column.T)
         self.transmittance = np.exp(-(extinction.T @ total)).T
         seen = (extinction.T @ from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
-        ray, near, step, from_start, density = ray[seen], near[seen], step[seen], from_start[:, seen], density[..., seen]
+        ray, near, step, from_start, density = (
+            ray[seen],
+            near[seen],
+            step[seen],
+            from_start[:, seen],
+            density[..., seen],
+        )
 
         x, w = gauss_legendre(nodes)
         inner = from_start[:, None] + np.einsum("gf,kfp->kgp", running_integral(4, tuple(x)), density) * step

@@ -19,13 +19,13 @@ import numpy as np
 
 from .. import mapping
 from ..backend import floats, packet, padded, parameter, types
-from ..march import Rays
 from ..mapping import texels
-from ..phase import Isotropic, RayleighPhase
+from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
 from .mean_source import MeanSource, Series, view_cosines
 from .sightlines import Sightlines, Sunlight
+from .sky_view import NodeLight, Nodes, channels_last, is_peaked
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
 OFF_ENDS = 1e-4  # of the unit altitude: where rays have some length
@@ -57,9 +57,12 @@ class Tables4D:
         # As far as the solver's own suns go: sunlight reaches the top's horizon, and scattered light once more.
         dip = np.arccos(self.radius / air.top_radius_m)
         self.lowest = float(np.cos(min(0.5 * np.pi + 2.2 * dip, np.pi)))
-        self._bands = [_Band4D(self, band) for band in sky.bands]
+        self.atmosphere = air
+        self.bands = [_Band4D(self, band) for band in sky.bands]
 
-    def rays(self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, *, ground: bool = True) -> RayLight:
+    def rays(
+        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, *, ground: bool = True
+    ) -> RayLight:
         """Radiance and transmittance of whole rays, as ``Sky.rays`` gives them."""
         rays, meets_air, _ = self.sky.enter(altitude_m, sun_zenith, view_zenith, azimuth)
         found = self.lookup(rays, ground=ground)
@@ -71,7 +74,7 @@ class Tables4D:
     def lookup(self, rays: Rays, *, ground: bool = True) -> RayLight:
         """The same for rays inside the atmosphere."""
         place = self._place(rays)
-        parts = [band.at(rays, place, ground) for band in self._bands]
+        parts = [band.at(rays, place, ground) for band in self.bands]
         return RayLight([v for p in parts for v in p[0]], [v for p in parts for v in p[1]])
 
     def _place(self, rays: Rays) -> dict[str, Any]:
@@ -89,10 +92,29 @@ class Tables4D:
             "phi": dr.clip(0.5 - 0.5 * (rays.nu - rays.mu * rays.mu_s) / sines, 0.0, 1.0),
         }
 
+    def light_at(self, band: _Band4D, nodes: Nodes) -> NodeLight:
+        """Light at the nodes of a SkyView inside the atmosphere: what it needs to be made from these tables."""
+        rows, columns = nodes.shape
+        mu, up = (np.repeat(v, columns) for v in (nodes.mu, nodes.up))
+        optics = band.optics
+        h = floats(np.full(mu.size, nodes.h))
+        rays = rays_to_boundary(optics, h, floats(mu), floats(np.full(mu.size, nodes.mu_s)), floats(nodes.nu))
+        rays.ground = types().Bool(~up)
+        smooth, peaks, through = band.parts(rays, self._place(rays))
+        glow = ground_light(optics, band.band.columns, rays, band.band.field)
+        smooth = [dr.fma(v, g, s) for v, g, s in zip(through, glow, smooth, strict=True)]
+        dr.eval(smooth, peaks, through)
+        kinds = [optics.scatterers[n] for n in band.peaks]
+        return NodeLight(
+            channels_last(smooth, nodes.shape),
+            {k: channels_last(light, nodes.shape) for k, light in zip(kinds, peaks, strict=True)},
+            channels_last(through, nodes.shape)[:, 0],
+        )
+
     @property
     def nbytes(self) -> int:
         """Bytes of all tables."""
-        return sum(band.nbytes for band in self._bands)
+        return sum(band.nbytes for band in self.bands)
 
 
 class _Band4D:
@@ -100,11 +122,8 @@ class _Band4D:
         self.tables, self.band, self.optics = tables, band, band.optics
         self.channels = self.optics.channel_count
         self.padded = padded(self.channels)
-        self.peaks = [
-            n
-            for n, k in enumerate(self.optics.scatterers)
-            if not isinstance(self.optics.constituents[k].phase, RayleighPhase | Isotropic)
-        ]
+        constituents = self.optics.constituents
+        self.peaks = [n for n, k in enumerate(self.optics.scatterers) if is_peaked(constituents[k])]
         self._bake_irradiance()
         self._bake_scattering()
         self._bake_light()
@@ -179,7 +198,9 @@ class _Band4D:
             dr.eval(quotient)
             values = np.stack([q.numpy() for q in quotient], axis=-1)
             stored_groups.append(values.reshape(len(h), rows, suns, azimuths, -1))
-        values = np.concatenate([np.pad(v, [(0, 0)] * 4 + [(0, self.padded - self.channels)]) for v in stored_groups], -1)
+        values = np.concatenate(
+            [np.pad(v, [(0, 0)] * 4 + [(0, self.padded - self.channels)]) for v in stored_groups], -1
+        )
         extra = (1 << (values.shape[-1] - 1).bit_length()) - values.shape[-1]
         values = np.pad(values, [(0, 0)] * 4 + [(0, extra)])
         self.count = values.shape[-1]
@@ -274,4 +295,3 @@ def _split(x: Any, count: Any) -> tuple[Any, Any]:
     x = x * t.Float(count - 1)
     i = dr.clip(t.Int(x), 0, t.Int(count - 2))
     return i, dr.minimum(x - t.Float(i), 1.0)
-
