@@ -63,7 +63,8 @@ class Sightlines:
     distances ``start`` and ``stop`` (m; by default from the observer to the ground or out of the air).
 
     ``stretches``: the field of later orders is asked once in about so many parts of a ray (0: in every piece).
-    ``ground``: which rays meet the ground, where rounding must not decide it (the horizon itself). All arguments are
+    ``ground``: which rays end on the ground, where rounding must not decide it (the horizon itself) or where rays are
+    to go on through it, in air as it is on the ground. All arguments are
     float64 arrays [R]. Attributes, [R] or [R, ...]: ``start``, ``stop``; ``ground``: the ray ends
     there; ``transmittance`` [R, C]; ``scattering`` [R, K, C]: integral of scattering coefficient times transmittance
     along the ray, for every scatterer.
@@ -98,9 +99,10 @@ class Sightlines:
         self.start = begin if start is None else np.clip(start, begin, end)
         self.stop = end if stop is None else np.clip(stop, self.start, end)
         self.ground = hits & (self.stop >= end) & (end >= begin)
-        # Shells passed on the way down, from the top on, then those on the way up.
-        near = np.concatenate([middle[:, None] - half[:, :0:-1], middle[:, None] + half[:, :-1]], axis=1)
-        far = np.concatenate([middle[:, None] - half[:, -2::-1], middle[:, None] + half[:, 1:]], axis=1)
+        # Shells passed on the way down, from the top on; what lies below the ground, where a ray is told to go on through
+        # it; the shells on the way up.
+        bounds = np.concatenate([middle[:, None] - half[:, ::-1], middle[:, None] + half], axis=1)
+        near, far = bounds[:, :-1], bounds[:, 1:]
         near, far = (np.clip(d, self.start[:, None], self.stop[:, None]) for d in (near, far))
         ray, shell = np.nonzero(far > near)
         self._cut(sine, ray, near[ray, shell], far[ray, shell], nodes)

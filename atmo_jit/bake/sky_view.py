@@ -26,6 +26,8 @@ from .mean_source import MeanSource, view_cosines, view_range
 from .sightlines import Sightlines, Sunlight
 
 SIZE = (96, 48, 64)  # rows above the horizon, rows below, columns
+# Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
+DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
 LARGEST_HALF = 3e4  # tables are scaled to this: half precision then is exact to 0.05 % over nine decades
 
@@ -222,7 +224,8 @@ def light_at_nodes(band: Any, nodes: Nodes) -> NodeLight:
     """Light at the nodes from the solution itself, by :class:`Sightlines`: many suns are one here, many azimuths along
     shared rays take their place."""
     optics, shape = band.optics, nodes.shape
-    lines = Sightlines(optics, np.full(shape[0], nodes.h), nodes.mu, ground=~nodes.up)
+    quadrature = DAY_NODES if nodes.mu_s > TWILIGHT else TWILIGHT_NODES
+    lines = Sightlines(optics, np.full(shape[0], nodes.h), nodes.mu, ground=~nodes.up, nodes=quadrature)
     ray = uints(np.repeat(np.arange(shape[0]), shape[1]))
     sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
     sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
