@@ -73,13 +73,21 @@ class NodeLight:
 
 
 class SkyView:
-    """Radiance seen from ``altitude_m`` under a sun at ``sun_zenith`` (rad), ground included.
+    """Radiance seen from ``altitude_m`` under a sun at ``sun_zenith`` (rad); ``ground=False`` leaves out the ground's own.
 
     ``source``: a solved Sky, or Tables4D to take the light from. ``size``: rows above the horizon, rows below it,
     columns from the sun's azimuth to the opposite one.
     """
 
-    def __init__(self, source: Any, altitude_m: float, sun_zenith: float, size: tuple[int, int, int] = SIZE) -> None:
+    def __init__(
+        self,
+        source: Any,
+        altitude_m: float,
+        sun_zenith: float,
+        size: tuple[int, int, int] = SIZE,
+        *,
+        ground: bool = True,
+    ) -> None:
         self.altitude_m, self.sun_zenith, self.size = float(altitude_m), float(sun_zenith), size
         air = source.atmosphere
         up_count, down_count, columns = size
@@ -99,7 +107,7 @@ class SkyView:
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
         light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
-        self._bands = [_Table.of(band.optics, nodes, light_at(band, nodes), size) for band in source.bands]
+        self._bands = [_Table.of(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
 
     def radiance(self, view_zenith: Any, azimuth: Any) -> list[Any]:
         """W Floats: radiance toward views at these angles (rad), ``azimuth`` from the sun's."""
@@ -220,7 +228,7 @@ class _Table:
         return [dr.lerp(a, b, f) for a, b in zip(low, high, strict=True)][: self.channels]
 
 
-def light_at_nodes(band: Any, nodes: Nodes) -> NodeLight:
+def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
     """Light at the nodes from the solution itself, by :class:`Sightlines`: many suns are one here, many azimuths along
     shared rays take their place."""
     optics, shape = band.optics, nodes.shape
@@ -230,7 +238,9 @@ def light_at_nodes(band: Any, nodes: Nodes) -> NodeLight:
     sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
     sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
     nu = lines.nu(ray, sun, across)
-    smooth = channels_last(lines.ground_light(band, ray, sun, across), shape)
+    smooth = np.zeros((*shape, optics.channel_count))
+    if ground:
+        smooth = channels_last(lines.ground_light(band, ray, sun, across), shape)
     if band.source is not None:
         whole = lines.scattering.reshape(1, *lines.scattering.shape)
         source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))

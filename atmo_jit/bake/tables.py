@@ -92,7 +92,7 @@ class Tables4D:
             "phi": dr.clip(0.5 - 0.5 * (rays.nu - rays.mu * rays.mu_s) / sines, 0.0, 1.0),
         }
 
-    def light_at(self, band: _Band4D, nodes: Nodes) -> NodeLight:
+    def light_at(self, band: _Band4D, nodes: Nodes, ground: bool) -> NodeLight:
         """Light at the nodes of a SkyView inside the atmosphere: what it needs to be made from these tables."""
         rows, columns = nodes.shape
         mu, up = (np.repeat(v, columns) for v in (nodes.mu, nodes.up))
@@ -101,8 +101,9 @@ class Tables4D:
         rays = rays_to_boundary(optics, h, floats(mu), floats(np.full(mu.size, nodes.mu_s)), floats(nodes.nu))
         rays.ground = types().Bool(~up)
         smooth, peaks, through = band.parts(rays, self._place(rays))
-        glow = ground_light(optics, band.band.columns, rays, band.band.field)
-        smooth = [dr.fma(v, g, s) for v, g, s in zip(through, glow, smooth, strict=True)]
+        if ground:
+            glow = ground_light(optics, band.band.columns, rays, band.band.field)
+            smooth = [dr.fma(v, g, s) for v, g, s in zip(through, glow, smooth, strict=True)]
         dr.eval(smooth, peaks, through)
         kinds = [optics.scatterers[n] for n in band.peaks]
         return NodeLight(
