@@ -290,6 +290,16 @@ def from_horizon_inverse(x: Any, edge: Any, end: Any) -> Any:
     return edge + (end - edge) * x * x
 
 
+def crowded(x: Any, crowding: Any) -> Any:
+    """x (1 + c) / (1 + c x): keeps 0 and 1, and makes room about 0, for half of the range below x = 1 / (2 + c)."""
+    return x * (1.0 + crowding) / (1.0 + crowding * x)
+
+
+def crowded_inverse(y: Any, crowding: Any) -> Any:
+    """x = y / (1 + c (1 - y))."""
+    return y / (1.0 + crowding * (1.0 - y))
+
+
 def half_azimuth(cos_phi: Any) -> Any:
     """x = sin(phi / 2) = sqrt((1 - cos phi) / 2): 0 toward the sun, 1 opposite. H20."""
     return _root(0.5 - 0.5 * cos_phi)

@@ -149,6 +149,15 @@ def test_power_round_trip(planet, powers, about_horizon):
     assert_close((mu[level],), (horizon(planet[0], h[level]) if about_horizon else np.zeros(level.sum()),))
 
 
+@pytest.mark.parametrize("lowest", [-0.3, -1.0, 0.0])
+def test_twilight_sun_round_trip(lowest):
+    x = texels(50)
+    for steepness in (1.0, 4.0, 20.0):
+        mu_s = mapping.twilight_sun_inverse(x, lowest, steepness)
+        assert mu_s[0] == pytest.approx(lowest, abs=1e-12) and mu_s[-1] == pytest.approx(1.0, abs=1e-12)
+        assert_close((mapping.twilight_sun(mu_s, lowest, steepness),), (x,))
+
+
 def test_half_elevation_round_trip_and_ends():
     mu = np.concatenate([np.linspace(-1, 1, 1001), [1e-9, -1e-9]])
     q = mapping.half_elevation(mu)
@@ -160,6 +169,10 @@ def test_half_elevation_round_trip_and_ends():
         q = mapping.from_horizon_inverse(x, edge, end)
         assert q[0] == edge and q[-1] == pytest.approx(end)
         assert_close((mapping.from_horizon(q, edge, end),), (x,))
+    for c in (0.0, 1.0, 30.0):
+        y = mapping.crowded(x, c)
+        assert y[0] == 0.0 and y[-1] == 1.0 and mapping.crowded(1.0 / (2.0 + c), c) == pytest.approx(0.5)
+        assert_close((mapping.crowded_inverse(y, c),), (x,))
     assert_close((mapping.half_azimuth(mapping.half_azimuth_inverse(x)),), (x,))
     assert_close((mapping.half_azimuth_inverse(x),), (np.cos(2 * np.arcsin(x)),))
 

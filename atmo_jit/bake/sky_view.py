@@ -28,6 +28,7 @@ from .sightlines import Sightlines, Sunlight
 SIZE = (96, 48, 64)  # rows above the horizon, rows below, columns
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
+SMALLEST_DIP = 0.01  # unit latitude; of an observer some centimetres above the ground
 OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
 LARGEST_HALF = 3e4  # tables are scaled to this: half precision then is exact to 0.05 % over nine decades
 
@@ -92,7 +93,11 @@ class SkyView:
         air = source.atmosphere
         up_count, down_count, columns = size
         edge, end = view_range(air.bottom_radius_m, air.thickness_m, np.array(self.altitude_m))
-        x = np.maximum(np.concatenate([mapping.texels(up_count), mapping.texels(down_count)]), OFF_EDGE)
+        # Below the horizon light changes with the distance to the ground, and so on the scale of the horizon's dip.
+        dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
+        crowding = float(0.5 / max(dip, SMALLEST_DIP))
+        below = mapping.crowded_inverse(mapping.texels(down_count), crowding)
+        x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
         up = np.arange(len(x)) < up_count
         mu = view_cosines(air.bottom_radius_m, air.thickness_m, np.array([[self.altitude_m]]), x, up)[0]
         cos_phi = mapping.half_azimuth_inverse(mapping.texels(columns))
@@ -103,7 +108,8 @@ class SkyView:
             parameter(1.0 / (edge + mapping.STEEPEST)),
         )
         self._limb = bool(end < mapping.STEEPEST)
-        self._up, self._down = parameter(up_count - 1.0), parameter(down_count - 1.0)
+        self._crowding, self._up = parameter(crowding), parameter(up_count - 1.0)
+        self._down = parameter((down_count - 1.0) * (1.0 + crowding))
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
         light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
@@ -123,7 +129,7 @@ class SkyView:
         up, latitude = self._latitude(z, square * inverse)
         column = dr.sqrt(dr.maximum(dr.fma(x * inverse, -0.5, 0.5), 0.0)) * self._columns
         nu = dr.fma(z, self._mu_s, x * self._sin_s)
-        row = dr.minimum(latitude, 1.0) * dr.select(up, self._up, self._down)
+        row = self._row(up, latitude)
         found = [v for table in self._bands for v in table.at(up, row, column, nu)]
         return [dr.select(up & (latitude > 1.0), 0.0, v) for v in found] if self._limb else found
 
@@ -131,9 +137,14 @@ class SkyView:
         """W Floats: transmittance to the ground or out of the air at this view zenith angle (rad)."""
         sine, cosine = dr.sincos(types().Float(view_zenith))
         up, latitude = self._latitude(cosine, sine)
-        row = dr.minimum(latitude, 1.0) * dr.select(up, self._up, self._down)
+        row = self._row(up, latitude)
         found = [v for table in self._bands for v in table.through(up, row)]
         return [dr.select(up & (latitude > 1.0), 1.0, v) for v in found] if self._limb else found
+
+    def _row(self, up: Any, latitude: Any) -> Any:
+        """Fractional row of a half of the table."""
+        x = dr.minimum(latitude, 1.0)
+        return dr.select(up, x * self._up, x * self._down / dr.fma(x, self._crowding, 1.0))
 
     def _latitude(self, z: Any, across: Any) -> tuple[Any, Any]:
         """Whether a view of sine ``z`` and cosine ``across`` of elevation looks above the horizon, and its unit latitude:
