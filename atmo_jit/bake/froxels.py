@@ -43,6 +43,7 @@ class Froxels:
     ) -> None:
         self.rows, self.columns = view_zenith.shape
         self.slices, self.reach_m = slices, float(reach_m)
+        self.altitude_m, self.sun_zenith = float(altitude_m), float(sun_zenith)
         self._reach = parameter(self.reach_m)
         self._mu_s = parameter(np.cos(sun_zenith))
         distance = Hillaire.slice_inverse(texels(slices + 1), self.reach_m)
@@ -86,30 +87,36 @@ class Froxels:
         row and column of views, 1 in the last."""
         t = types()
         distance = dr.minimum(t.Float(distance), self._reach)
-        axes = ((Hillaire.slice(distance, self._reach), self.slices + 1), (v, self.rows), (u, self.columns))
-        cells = [_cell(x, count) for x, count in axes]
-        (k, fw), (i, fv), (j, fu) = cells
-        view = i * self.columns + j
+        k, fw = _cell(Hillaire.slice(distance, self._reach), self.slices + 1)
+        view, fv, fu = self._view(v, u)
         steps = (self.rows * self.columns, self.columns, 1)
         base = k * steps[0] + view
-        direction = [
-            _blend(
-                lambda o, axis=axis: [dr.gather(t.Float, self._directions, t.UInt((view + o) * 3 + axis))],
-                steps[1:],
-                (fv, fu),
-            )[0]
-            for axis in range(3)
-        ]
-        scale = dr.rsqrt(
-            dr.fma(direction[0], direction[0], dr.fma(direction[1], direction[1], direction[2] * direction[2]))
-        )
-        nu = dr.fma(direction[2], self._mu_s, direction[0] * self._sin_s) * scale
+        x, _, z = self.direction(v, u)
+        nu = dr.fma(z, self._mu_s, x * self._sin_s)
         radiance, transmittance = [], []
         for band in self._bands:
             light, depth = band.at(base, steps, (fw, fv, fu), nu)
             radiance += [dr.maximum(v, 0.0) * distance for v in light]
             transmittance += [dr.exp(-v * distance) for v in depth]
         return RayLight(radiance, transmittance)
+
+    def direction(self, v: Any, u: Any) -> tuple[Any, Any, Any]:
+        """Unit vector of the view at (v, u), z up and the sun above or below the x axis."""
+        t = types()
+        view, fv, fu = self._view(v, u)
+
+        def read(offset: int) -> list[Any]:
+            return [dr.gather(t.Float, self._directions, t.UInt((view + offset) * 3 + axis)) for axis in range(3)]
+
+        x, y, z = _blend(read, (self.columns, 1), (fv, fu))
+        scale = dr.rsqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
+        return x * scale, y * scale, z * scale
+
+    def _view(self, v: Any, u: Any) -> tuple[Any, Any, Any]:
+        """First of the four views about (v, u), and the fractions of row and column."""
+        i, fv = _cell(v, self.rows)
+        j, fu = _cell(u, self.columns)
+        return i * self.columns + j, fv, fu
 
     @property
     def nbytes(self) -> int:
