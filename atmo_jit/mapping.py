@@ -291,13 +291,15 @@ def from_horizon_inverse(x: Any, edge: Any, end: Any) -> Any:
 
 
 def crowded(x: Any, crowding: Any) -> Any:
-    """x (1 + c) / (1 + c x): keeps 0 and 1, and makes room about 0, for half of the range below x = 1 / (2 + c)."""
-    return x * (1.0 + crowding) / (1.0 + crowding * x)
+    """y = x / 2 (1 + (1 + c) / (1 + c x)): keeps 0 and 1, and spreads what lies about 0, below x = 1 / c, over a quarter
+    of the range without taking more than half of the room of what lies about 1."""
+    return 0.5 * x * (1.0 + (1.0 + crowding) / (1.0 + crowding * x))
 
 
 def crowded_inverse(y: Any, crowding: Any) -> Any:
-    """x = y / (1 + c (1 - y))."""
-    return y / (1.0 + crowding * (1.0 - y))
+    """x, the positive root of c x^2 + (2 + c - 2 c y) x - 2 y = 0."""
+    half = 1.0 + crowding * (0.5 - y)
+    return 2.0 * y / (half + _root(half * half + 2.0 * crowding * y))
 
 
 def half_azimuth(cos_phi: Any) -> Any:
@@ -311,8 +313,8 @@ def half_azimuth_inverse(x: Any) -> Any:
 
 
 def twilight_sun(mu_s: Any, lowest: float, steepness: float) -> Any:
-    """x = (atan(k mu_s) - atan(k lowest)) / (atan(k) - atan(k lowest)): suns crowd about the horizontal, from ``lowest``
-    (0) to the zenith (1).
+    """x = (atan(k mu_s) - atan(k lowest)) / (atan(k) - atan(k lowest)): from ``lowest`` (0) to the zenith (1), crowded
+    about the horizontal.
 
     The form of B08's map for mu_s; the steepness k is a parameter here.
     """

@@ -1,4 +1,4 @@
-"""The tables of Bruneton's family, at the sizes that their clients have built in: transmittance, irradiance, scattering.
+"""The tables of Bruneton's family, at the sizes that clients have built in: transmittance, irradiance, scattering.
 
 Layout and maps are those of ``mapping.Bruneton``; what is stored in them is this package's solution, not the one that
 Bruneton's programs would compute.
@@ -19,7 +19,8 @@ from ..mapping import Bruneton, texels
 from ..phase import RayleighPhase
 from ..sky import Sky
 from .mean_source import MeanSource, Series, view_range
-from .sightlines import Sightlines, Sunlight
+from .sightlines import Sightlines
+from .sunlight import Sunlight
 
 TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines

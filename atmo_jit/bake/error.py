@@ -104,9 +104,10 @@ def froxels_error(froxels: Froxels, sky: Sky, count: int = 2000, seed: int = 0) 
     v, u, distance = rng.random(count), rng.random(count), froxels.reach_m * rng.random(count) ** 2
     x, y, z = (c.numpy().astype(float) for c in froxels.direction(floats(v), floats(u)))
     zenith, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
-    r, h = sky.atmosphere.bottom_radius_m + froxels.altitude_m, froxels.altitude_m
-    rise = distance * (2.0 * r * np.cos(zenith) + distance)
-    kept = h + rise / (r + np.sqrt(r * r + rise)) > 0.0
+    radius, h = sky.atmosphere.bottom_radius_m, froxels.altitude_m
+    along, square = (radius + h) * np.cos(zenith), h * (2.0 * radius + h)
+    hits = (along < 0.0) & (along**2 > square)
+    kept = ~hits | (distance < -along - np.sqrt(np.maximum(along**2 - square, 0.0)))
     v, u, distance, zenith, azimuth = (a[kept] for a in (v, u, distance, zenith, azimuth))
     constant = [np.full(v.size, a) for a in (froxels.altitude_m, froxels.sun_zenith)]
     exact = sky.rays(*map(doubles, (*constant, zenith, azimuth, distance)), ground=False)

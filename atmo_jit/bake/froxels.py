@@ -17,8 +17,9 @@ import numpy as np
 from ..backend import floats, packet, padded, parameter, types
 from ..mapping import Hillaire, texels
 from ..sky import RayLight, Sky
-from .sightlines import Sightlines, Sunlight
+from .sightlines import Sightlines
 from .sky_view import channels_last, is_peaked
+from .sunlight import Sunlight
 
 SLICES = 32
 FIRST = 0.01  # of the first slice's depth: where the light of no distance at all is measured

@@ -26,8 +26,8 @@ class MeanSource:
     """Means for the suns ``mu_s`` [S], at Chebyshev nodes from the ground to the top or at the one altitude ``h`` [1]
     (m), which may lie above it.
 
-    ``harmonics`` [altitude, up + down, sun, azimuthal order, scatterer, channel]. How many nodes follows from the degree
-    of the field: what is scattered toward the observer has the harmonics of the light that it comes from.
+    ``harmonics`` [altitude, up + down, sun, azimuthal order, scatterer, channel]. How many nodes follows from the
+    degree of the field: what is scattered toward the observer has the harmonics of the light that it comes from.
     """
 
     def __init__(self, band: Any, mu_s: np.ndarray, h: np.ndarray | None = None) -> None:
@@ -79,8 +79,8 @@ class MeanSource:
 
 
 def view_cosines(radius: float, thickness: float, h: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """mu at ``x``: 0 on the horizon, 1 at the zenith (above the air: at the top of its limb) or, where not ``up``, at the
-    nadir; mapping.from_horizon of mapping.half_elevation."""
+    """mu at ``x``: 0 on the horizon, 1 at the zenith (above the air: at the top of its limb) or, where not ``up``, at
+    the nadir; mapping.from_horizon of mapping.half_elevation."""
     edge, end = view_range(radius, thickness, h)
     q = mapping.from_horizon_inverse(x, edge, np.where(up, end, -mapping.STEEPEST))
     return mapping.half_elevation_inverse(q)

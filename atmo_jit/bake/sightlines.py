@@ -3,8 +3,8 @@
 A table asks for the same view rays again and again, under other suns. What a ray scatters toward its origin, density
 times transmittance at the nodes of a quadrature, has no sun in it: :class:`Sightlines` computes it once, in double
 precision, and :meth:`Sightlines.single` and :meth:`Sightlines.multiple` then sum sunlight and the solved field over
-those nodes for any number of suns. Single scattering comes per constituent and without its phase function, which varies too fast to be
-interpolated.
+those nodes for any number of suns. Single scattering comes per constituent and without its phase function, which
+varies too fast to be interpolated.
 
 Two approximations set this apart from the march of ``Sky.rays``. Direct sunlight at a node is interpolated in a table
 over altitude and sun cosine. Pieces are not cut at the planet's shadow; instead the sun's visible part is averaged
@@ -18,56 +18,30 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend import floats, packet, padded, stored, types, uints
-from ..column import SunColumns
+from ..backend import floats, packet, padded, types, uints
 from ..march import relative_azimuth
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
 from ..single_scattering import horizontal_irradiance
+from .sunlight import SIZE as SUNLIGHT
+from .sunlight import Sunlight
 
 NODES = 3  # Gauss-Legendre nodes per piece
 MAX_DEPTH = 1.0  # optical depth of a piece
 SPENT_DEPTH = 16.0  # what lies behind 1e-7 of transmittance is not seen
 LONGEST = 32  # pieces into which one shell is cut at most
-SUNLIGHT = (96, 320)  # altitudes, sun cosines
-
-
-class Sunlight:
-    """Transmittance from altitude toward the sun: rows even in the square root of altitude, columns even in
-    sqrt((mu_s - horizon) / (1 - horizon)), so that both crowd where it changes."""
-
-    def __init__(self, optics: Optics, columns: SunColumns, size: tuple[int, int] = SUNLIGHT) -> None:
-        t = types()
-        self.rows, self.cosines = size
-        self.size = padded(optics.channel_count)
-        lane = dr.arange(t.UInt, self.rows * self.cosines)
-        y, x = t.Float(lane // self.cosines) / (self.rows - 1.0), t.Float(lane % self.cosines) / (self.cosines - 1.0)
-        h = optics.thickness * y * y
-        horizon = -dr.sqrt(h * (2.0 * optics.radius + h)) / (optics.radius + h)
-        depths = optics.optical_depths(columns.toward(h, dr.fma(1.0 - horizon, x * x, horizon)))
-        self.table = stored([dr.exp(-d) for d in depths], lane, self.size)
-
-    def at(self, row: Any, x: Any) -> list[Any]:
-        """Per channel (and padding), at a fractional row and at sqrt((mu_s - horizon) / (1 - horizon))."""
-        t = types()
-        x = dr.minimum(x, 1.0) * (self.cosines - 1)
-        j, i = dr.minimum(t.Int(x), self.cosines - 2), dr.minimum(t.Int(row), self.rows - 2)
-        fx, fy = x - t.Float(j), row - t.Float(i)
-        corner = t.UInt(dr.fma(i, self.cosines, j))
-        a, b, c, d = (packet(self.table, corner + o, self.size) for o in (0, 1, self.cosines, self.cosines + 1))
-        return [dr.lerp(dr.lerp(p, q, fx), dr.lerp(r, s, fx), fy) for p, q, r, s in zip(a, b, c, d, strict=True)]
 
 
 class Sightlines:
     """View rays of one band, from altitude ``h`` (m, also above the air) at zenith cosine ``mu``, between the
     distances ``start`` and ``stop`` (m; by default from the observer to the ground or out of the air).
 
-    ``stretches``: the field of later orders is asked once in about so many parts of a ray (0: in every piece).
     ``ground``: which rays end on the ground, where rounding must not decide it (the horizon itself) or where rays are
-    to go on through it, in air as it is on the ground. All arguments are
-    float64 arrays [R]. Attributes, [R] or [R, ...]: ``start``, ``stop``; ``ground``: the ray ends
-    there; ``transmittance`` [R, C]; ``scattering`` [R, K, C]: integral of scattering coefficient times transmittance
-    along the ray, for every scatterer.
+    to go on through it, in air as it is on the ground. ``stretches``: the field of later orders is asked once in about
+    so many parts of a ray (0: in every piece). All arrays are float64 [R].
+
+    Attributes: ``start``, ``stop`` [R]; ``ground`` [R]: the ray ends there; ``transmittance`` [R, C]; ``scattering``
+    [R, K, C]: integral of scattering coefficient times transmittance along the ray, for every scatterer.
     """
 
     def __init__(
@@ -99,8 +73,8 @@ class Sightlines:
         self.start = begin if start is None else np.clip(start, begin, end)
         self.stop = end if stop is None else np.clip(stop, self.start, end)
         self.ground = hits & (self.stop >= end) & (end >= begin)
-        # Shells passed on the way down, from the top on; what lies below the ground, where a ray is told to go on through
-        # it; the shells on the way up.
+        # Shells passed on the way down, from the top on; what lies below the ground, where a ray is told to go on
+        # through it; the shells on the way up.
         bounds = np.concatenate([middle[:, None] - half[:, ::-1], middle[:, None] + half], axis=1)
         near, far = bounds[:, :-1], bounds[:, 1:]
         near, far = (np.clip(d, self.start[:, None], self.stop[:, None]) for d in (near, far))
@@ -130,14 +104,8 @@ class Sightlines:
         np.add.at(total.T, ray, column.T)
         self.transmittance = np.exp(-(extinction.T @ total)).T
         seen = (extinction.T @ from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
-        ray, near, step, from_start, density = (
-            ray[seen],
-            near[seen],
-            step[seen],
-            from_start[:, seen],
-            density[..., seen],
-        )
-
+        ray, near, step = ray[seen], near[seen], step[seen]
+        from_start, density = from_start[:, seen], density[..., seen]
         x, w = gauss_legendre(nodes)
         inner = from_start[:, None] + np.einsum("gf,kfp->kgp", running_integral(4, tuple(x)), density) * step
         distance = near + step * x[:, None]
@@ -158,7 +126,10 @@ class Sightlines:
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
 
     def _gather_stretches(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
-        """Neighbouring pieces as stretches with about equal shares of what the ray scatters, and the centroid of each. ``distance`` [piece, node], ``weight`` [piece, node, scatterer, channel]."""
+        """Neighbouring pieces as stretches with about equal shares of what the ray scatters, and the centroid of each.
+
+        ``distance`` [piece, node], ``weight`` [piece, node, scatterer, channel].
+        """
         channels = np.maximum(self.scattering.sum(axis=1), 1e-300)
         share = (weight.sum(axis=2) / channels[ray][:, None]).mean(axis=2)
         by_piece = share.sum(axis=1)
@@ -168,15 +139,12 @@ class Sightlines:
         rising = distance[:, 0] >= -(self.r * self.mu)[ray]
         key = (ray * (self._parts + 1) + part) * 2 + rising if self._parts else np.arange(len(ray))
         first = np.flatnonzero(np.diff(key, prepend=-1))
-        total = np.add.reduceat(by_piece, first) if len(first) else by_piece
-        moment = np.add.reduceat((share * distance).sum(axis=1), first) if len(first) else by_piece
+        total, moment = (np.add.reduceat(v, first) for v in (by_piece, (share * distance).sum(axis=1)))
         ray = ray[first]
         lit = total > 0.0
         centre = np.where(lit, moment / np.where(lit, total, 1.0), distance[first, 0])
         self._stretches = self._table(sine, ray, centre, np.zeros(len(first)))
-        self._stretch_weights = _padded_channels(
-            np.add.reduceat(weight.sum(axis=1), first) if len(first) else weight.sum(axis=1)
-        )
+        self._stretch_weights = _padded_channels(np.add.reduceat(weight.sum(axis=1), first))
         self._first_stretch = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)))
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,8 +154,8 @@ class Sightlines:
         return np.maximum(there - self.optics.atmosphere.bottom_radius_m, 0.0), there
 
     def _densities(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        h, _ = self._altitude(ray, distance)
-        return np.array([np.asarray(c.profile.density(h)) for c in self.optics.constituents]).reshape(-1, *h.shape)
+        h, constituents = self._altitude(ray, distance)[0], self.optics.constituents
+        return np.array([np.asarray(c.profile.density(h)) for c in constituents]).reshape(len(constituents), *h.shape)
 
     def _table(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
         """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's

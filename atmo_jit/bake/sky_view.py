@@ -23,9 +23,10 @@ from .. import mapping
 from ..backend import floats, packet, padded, parameter, types, uints
 from ..phase import Isotropic, RayleighPhase
 from .mean_source import MeanSource, view_cosines, view_range
-from .sightlines import Sightlines, Sunlight
+from .sightlines import Sightlines
+from .sunlight import Sunlight
 
-SIZE = (96, 48, 64)  # rows above the horizon, rows below, columns
+SIZE = (96, 64, 64)  # rows above the horizon, rows below, columns
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 SMALLEST_DIP = 0.01  # unit latitude; of an observer some centimetres above the ground
@@ -35,8 +36,8 @@ LARGEST_HALF = 3e4  # tables are scaled to this: half precision then is exact to
 
 @dataclass
 class Nodes:
-    """The table's nodes: altitude of the observer (m), unit latitude and cosine of the rows, which of them look above the
-    horizon; cosines of the columns' azimuths and of the sun."""
+    """The table's nodes: altitude of the observer (m); unit latitude and cosine of the rows, and which of them look
+    above the horizon; cosines of the columns' azimuths and of the sun."""
 
     h: float
     x: np.ndarray
@@ -74,7 +75,8 @@ class NodeLight:
 
 
 class SkyView:
-    """Radiance seen from ``altitude_m`` under a sun at ``sun_zenith`` (rad); ``ground=False`` leaves out the ground's own.
+    """Radiance seen from ``altitude_m`` under a sun at ``sun_zenith`` (rad), with the ground's own unless
+    ``ground=False``.
 
     ``source``: a solved Sky, or Tables4D to take the light from. ``size``: rows above the horizon, rows below it,
     columns from the sun's azimuth to the opposite one.
@@ -95,7 +97,7 @@ class SkyView:
         edge, end = view_range(air.bottom_radius_m, air.thickness_m, np.array(self.altitude_m))
         # Below the horizon light changes with the distance to the ground, and so on the scale of the horizon's dip.
         dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
-        crowding = float(0.5 / max(dip, SMALLEST_DIP))
+        crowding = float(1.0 / max(dip, SMALLEST_DIP))
         below = mapping.crowded_inverse(mapping.texels(down_count), crowding)
         x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
         up = np.arange(len(x)) < up_count
@@ -109,7 +111,7 @@ class SkyView:
         )
         self._limb = bool(end < mapping.STEEPEST)
         self._crowding, self._up = parameter(crowding), parameter(up_count - 1.0)
-        self._down = parameter((down_count - 1.0) * (1.0 + crowding))
+        self._down, self._crowded = parameter(0.5 * (down_count - 1.0)), parameter(1.0 + crowding)
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
         light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
@@ -144,11 +146,12 @@ class SkyView:
     def _row(self, up: Any, latitude: Any) -> Any:
         """Fractional row of a half of the table."""
         x = dr.minimum(latitude, 1.0)
-        return dr.select(up, x * self._up, x * self._down / dr.fma(x, self._crowding, 1.0))
+        below = dr.fma(self._crowded, dr.rcp(dr.fma(x, self._crowding, 1.0)), 1.0) * self._down
+        return x * dr.select(up, self._up, below)
 
     def _latitude(self, z: Any, across: Any) -> tuple[Any, Any]:
-        """Whether a view of sine ``z`` and cosine ``across`` of elevation looks above the horizon, and its unit latitude:
-        mapping.from_horizon of mapping.half_elevation, with the least arithmetic."""
+        """Whether a view of sine ``z`` and cosine ``across`` of elevation looks above the horizon, and its unit
+        latitude: mapping.from_horizon of mapping.half_elevation, with the least arithmetic."""
         q = dr.fma(z, dr.rsqrt(dr.fma(2.0, across, 2.0)), -self._edge)
         return q >= 0.0, dr.sqrt(dr.abs(q) * dr.select(q >= 0.0, self._per_range_up, self._per_range_down))
 

@@ -1,9 +1,10 @@
 """Radiance for all observers, suns and views of an atmosphere as one four-dimensional table.
 
-What is interpolated is made smooth first. From the light of a ray are divided out: what it scatters at all (the integral
-of scattering coefficient times transmittance along it, from a finer table over altitude and elevation), the irradiance
-of the sky under that sun (from one over altitude and sun), and the angle's part of Rayleigh's phase function, as far as
-it survives in all orders. Peaked scatterers are single-scattered apart, without their phase functions.
+What is interpolated is made smooth first. From the light of a ray are divided out: what it scatters at all (the
+integral of scattering coefficient times transmittance along it, from a finer table over altitude and elevation), the
+irradiance of the sky under that sun (from one over altitude and sun), and the angle's part of Rayleigh's phase
+function, as far as it survives in all orders. Single scattering by peaked scatterers is apart, without their phase
+functions.
 
 Axes: square root of altitude; elevation split at the horizon, as in :mod:`.sky_view`; sun cosine, dense at twilight;
 cosine of the azimuth from the sun. The ground's own light is computed from the irradiances where a ray ends on it.
@@ -24,12 +25,13 @@ from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
 from .mean_source import MeanSource, Series, view_cosines
-from .sightlines import Sightlines, Sunlight
+from .sightlines import Sightlines
 from .sky_view import NodeLight, Nodes, channels_last, is_peaked
+from .sunlight import Sunlight
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
 OFF_ENDS = 1e-4  # of the unit altitude: where rays have some length
-STEEPNESS = 4.0  # of mapping.twilight_sun
+STEEPNESS = 3.0  # of mapping.twilight_sun
 SURVIVING = 0.7  # of Rayleigh's nu^2 in light of all orders
 
 
@@ -41,7 +43,7 @@ class Size:
     altitudes: int = 16
     up: int = 20
     down: int = 12
-    suns: int = 48
+    suns: int = 64
     azimuths: int = 8
     scattering: tuple[int, int, int] = (96, 96, 64)
     irradiance: tuple[int, int] = (32, 256)
