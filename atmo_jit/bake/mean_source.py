@@ -18,6 +18,8 @@ from ..quadrature import half_circle
 from .sightlines import Sightlines
 
 ALTITUDES = 8
+# Nodes above and below the horizon and in azimuth at least; the latter where altitudes share them.
+LEAST, LEAST_COARSE = (16, 10, 8), (12, 8, 6)
 STRETCHES = 8
 COARSE_DEGREE = 9  # of tables over all suns and altitudes
 
@@ -35,8 +37,10 @@ class MeanSource:
         self.thickness = self.optics.atmosphere.thickness_m
         self.single = h is not None
         degree = band.field.degree if self.single else min(band.field.degree, COARSE_DEGREE)
-        self.up, self.down = max(10, 4 * degree // 3), max(8, 2 * degree // 3 + 2)
-        self.azimuths = azimuths = max(6, 4 * degree // 3 - 6)
+        least = LEAST if self.single else LEAST_COARSE
+        counts = (4 * degree // 3, 2 * degree // 3 + 2, 4 * degree // 3 - 6)
+        self.up, self.down, self.azimuths = map(max, least, counts)
+        azimuths = self.azimuths
         h = self.thickness * chebyshev_nodes(ALTITUDES) ** 2 if h is None else h
         x = np.concatenate([chebyshev_nodes(self.up), chebyshev_nodes(self.down)])
         up = np.arange(len(x)) < self.up

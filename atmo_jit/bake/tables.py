@@ -31,7 +31,7 @@ from .sunlight import Sunlight
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
 OFF_ENDS = 1e-4  # of the unit altitude: where rays have some length
-STEEPNESS = 3.0  # of mapping.twilight_sun
+STEEPNESS = 2.5  # of mapping.twilight_sun
 SURVIVING = 0.7  # of Rayleigh's nu^2 in light of all orders
 
 
@@ -141,7 +141,7 @@ class _Band4D:
         dr.eval(sky)
         values = np.stack([np.broadcast_to(v.numpy(), where[0].shape) for v in sky], axis=-1)
         values = values.reshape(*size, -1)
-        most = values.max(axis=1, keepdims=True)
+        most = values[:, -1:]  # under the highest sun
         self.irradiance = _Grid(np.maximum(values / np.where(most > 0.0, most, 1.0), 1e-12), self.padded)
 
     def _bake_scattering(self) -> None:
