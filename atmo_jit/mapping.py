@@ -291,8 +291,8 @@ def from_horizon_inverse(x: Any, edge: Any, end: Any) -> Any:
 
 
 def crowded(x: Any, crowding: Any) -> Any:
-    """y = x / 2 (1 + (1 + c) / (1 + c x)): keeps 0 and 1, and spreads what lies about 0, below x = 1 / c, over a quarter
-    of the range without taking more than half of the room of what lies about 1."""
+    """y = x / 2 (1 + (1 + c) / (1 + c x)): keeps 0 and 1, and spreads what lies about 0, below x = 1 / c, over a
+    quarter of the range without taking more than half of the room of what lies about 1."""
     return 0.5 * x * (1.0 + (1.0 + crowding) / (1.0 + crowding * x))
 
 

@@ -253,8 +253,12 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
     sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
     nu = lines.nu(ray, sun, across)
     smooth = np.zeros((*shape, optics.channel_count))
-    if ground:
-        smooth = channels_last(lines.ground_light(band, ray, sun, across), shape)
+    if ground:  # only rows below the horizon meet it
+        below = np.flatnonzero(~nodes.up)
+        glow_ray = uints(np.repeat(below, shape[1]))
+        glow_across = floats(np.broadcast_to(sin_s * nodes.cos_phi, (len(below), shape[1])))
+        glow = lines.ground_light(band, glow_ray, floats(np.full(glow_across.shape[0], nodes.mu_s)), glow_across)
+        smooth[below] = channels_last(glow, (len(below), shape[1]))
     if band.source is not None:
         whole = lines.scattering.reshape(1, *lines.scattering.shape)
         source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))

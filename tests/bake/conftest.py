@@ -1,4 +1,4 @@
-"""Solved skies that the tests of tables share: the Earth, thick haze with a sharp peak, and a planet unlike the Earth."""
+"""Solved skies that the tests of tables share: clear air, thick haze, planets unlike the Earth."""
 
 from __future__ import annotations
 
