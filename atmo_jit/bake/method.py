@@ -1,8 +1,9 @@
 """Which views of a list are worth a table, and their light from it.
 
 A table costs as much as marching some thousands of rays and then next to nothing per view. Views that share observer
-and sun get a :class:`SkyView`; many observers and suns get :class:`Tables4D`. Rays that stop early, rays close to the
-horizon, where tables err most, and rays that may meet a sun's disc that is asked for are always marched.
+and sun get a :class:`SkyView`; many observers and suns get :class:`Tables4D`. Always marched are rays that stop early,
+rays close to the horizon or to the edge of the air, where tables err most, and rays that may meet a sun's disc that is
+asked for.
 """
 
 from __future__ import annotations
@@ -43,13 +44,16 @@ def plan(sky: Sky, views: Mapping[str, np.ndarray], method: str, tolerance: floa
     """What to do with ``views`` (as from check_views): "tables" wherever they serve, "auto" where they pay and the
     tolerance allows."""
     altitude, sun, zenith = (views[name] for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg"))
-    radius = sky.atmosphere.bottom_radius_m
-    edge = np.degrees(np.arccos(mapping.horizon(radius, altitude)))
-    fit = np.abs(zenith - edge) > HORIZON_DEG
+    air = sky.atmosphere
+    fit = np.full(zenith.shape, bool(sky.bands[0].optics.scatterers))  # without them there is nothing to interpolate
+    edges = [mapping.horizon(air.bottom_radius_m, altitude)]
+    edges.append(mapping.horizon(air.top_radius_m, np.maximum(altitude - air.thickness_m, 0.0)))
+    for edge, seen in zip(edges, (True, altitude > air.thickness_m), strict=True):
+        fit &= ~(seen & (np.abs(zenith - np.degrees(np.arccos(edge))) <= HORIZON_DEG))
     if "distance_m" in views:
         fit &= np.isinf(views["distance_m"])
     if sun_disc:
-        fit &= np.abs(zenith - sun) > 2.0 * sky.atmosphere.sun_angular_radius_deg
+        fit &= np.abs(zenith - sun) > 2.0 * air.sun_angular_radius_deg
     pairs, which, counts = np.unique(np.stack([altitude, sun]), axis=1, return_inverse=True, return_counts=True)
     which = which.ravel()
     counts = np.bincount(which[fit], minlength=len(counts))
@@ -57,10 +61,10 @@ def plan(sky: Sky, views: Mapping[str, np.ndarray], method: str, tolerance: floa
     if method == "auto" and tolerance < SKY_VIEW_TOLERANCE:
         pays[:] = False
     left = fit & ~pays[which]
-    inside = altitude <= sky.atmosphere.thickness_m
+    inside = altitude <= air.thickness_m
     if method == "tables":
         few = len(np.unique(which[left])) * SKY_VIEW_RAYS <= TABLES_RAYS
-        pays |= (counts > 0) if few else (pairs[0] > sky.atmosphere.thickness_m) & (counts > 0)
+        pays |= (counts > 0) if few else (pairs[0] > air.thickness_m) & (counts > 0)
         in_tables = fit & ~pays[which]
     else:
         in_tables = left & inside & (sun <= TABLES_LOWEST_SUN_DEG) & (tolerance >= TABLES_TOLERANCE)

@@ -116,7 +116,7 @@ class Sightlines:
         np.add.at(self.scattering, ray, weight.sum(axis=1))
         self._gather_stretches(sine, ray, distance.T, weight)
         self._nodes = self._table(sine, np.repeat(ray, nodes), distance.T.ravel(), np.repeat(0.5 * step / nodes, nodes))
-        self._weights = _padded_channels(weight.reshape(-1, *weight.shape[2:]))
+        self._weights = _padded_channels(weight.reshape(len(ray) * nodes, *weight.shape[2:]))
         self._first_node = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)) * nodes)
         end = self._altitude(np.arange(len(self.mu)), self.stop)[1]
         self._ends = floats(

@@ -266,9 +266,8 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
         m = np.arange(series.shape[1])[:, None]
         smooth = smooth + np.einsum("vmc,mp->vpc", series, np.cos(m * np.arccos(np.clip(nodes.cos_phi, -1.0, 1.0))))
     peaks = {}
-    for k, single in zip(
-        optics.scatterers, lines.single(Sunlight(optics, band.columns), ray, sun, across, nu), strict=True
-    ):
+    singles = lines.single(Sunlight(optics, band.columns), ray, sun, across, nu) if optics.scatterers else []
+    for k, single in zip(optics.scatterers, singles, strict=True):
         if is_peaked(optics.constituents[k]):
             peaks[k] = channels_last(single, shape)
         else:

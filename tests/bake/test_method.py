@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 import atmo_jit
+from atmo_jit.backend import floats
 from atmo_jit.bake import method as methods
 from atmo_jit.bake.method import plan
+from atmo_jit.bake.sky_view import SkyView
+from atmo_jit.sky import Sky
 from atmo_jit.views import check_views
+from bench.worlds import WORLDS, world
 
 
 def many(count: int = 6000, seed: int = 0, **fixed) -> dict:
@@ -47,6 +51,28 @@ def test_one_observer_and_sun_get_a_sky_view(ground, sun_disc):
     np.testing.assert_allclose(found.transmittance, exact.transmittance, atol=2e-3)
     np.testing.assert_allclose(found.sky_irradiance, exact.sky_irradiance, rtol=1e-5)
     np.testing.assert_allclose(found.sun_irradiance, exact.sun_irradiance, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_every_world_keeps_the_tolerance(name):
+    """Any make-up of air, seen from the ground and from space; auto may take either way."""
+    for altitude, sun in ((3.0, 50.0), (4e5, 30.0)):
+        views = many(5000, altitude_m=altitude, sun_zenith_deg=sun)
+        exact, found = (atmo_jit.sky(WORLDS[name], views, method=method) for method in ("march", "auto"))
+        difference = error(found.radiance, exact.radiance)
+        assert np.percentile(difference, 99) < 2e-3 and difference.max() < 5e-2, (altitude, sun)
+
+
+@pytest.mark.parametrize("ozone", [None, {"absorption_per_m": 1e-6, "center_m": 22000, "half_width_m": 9000}])
+def test_air_that_does_not_scatter(ozone):
+    """Nothing to interpolate: the lit ground alone, behind clear or absorbing air."""
+    spec = world(rayleigh=None, mie=None, ozone=ozone)
+    exact, found = (atmo_jit.sky(spec, many(5000), method=method) for method in ("march", "tables"))
+    assert found.meta["method"] == "march" and np.array_equal(found.radiance, exact.radiance)
+    view = SkyView(Sky(spec), 2.0, 0.7)
+    light, through = view.radiance(floats([0.5, 2.6]), floats([0.0, 1.0])), view.transmittance(floats([0.5, 2.6]))
+    assert all(v.numpy()[0] == 0.0 and v.numpy()[1] > 0.0 for v in light)
+    assert all(np.all(v.numpy() > 0.9) for v in through)
 
 
 def test_few_views_are_marched():
