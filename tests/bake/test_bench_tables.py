@@ -1,12 +1,12 @@
-"""The peers in ``bench.tables``: the interpolation of their tables, and that at their own nodes they are the solution."""
+"""The peers in ``bench.tables``: how their tables are interpolated, and what they hold at their own nodes."""
 
 from __future__ import annotations
 
 import numpy as np
-from bench import tables as bench
 
 from atmo_jit.backend import doubles, floats
 from atmo_jit.mapping import texels
+from bench import tables as bench
 
 
 def test_interpolation_is_exact_for_products():
