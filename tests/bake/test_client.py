@@ -33,8 +33,8 @@ def test_transmittance_is_what_clients_compute(tables):
 
 
 def test_light_is_near_what_clients_compute(tables):
-    """Their scattering has four orders and a quadrature error: DESIGN of this table is to be closer to the truth, and
-    still the same quantity. Texel [altitude, mu row, column] with column = nu index * 32 + mu_s index."""
+    """Theirs have four orders and a quadrature error, so a few per cent are left between the same quantities. Texel
+    [altitude, mu row, column] with column = nu index * 32 + mu_s index."""
     column = np.unravel_index(255, (8, 32))
     assert tables.scattering[(4, 100, *column)] == pytest.approx((0.85771, 1.86726, 2.84126), rel=0.03)
     assert tables.mie[(4, 100, *column)][0] == pytest.approx(0.047378, rel=0.05)
