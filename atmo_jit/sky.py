@@ -30,7 +30,7 @@ from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views
 
-METHODS = ("auto", "march")
+METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
 
@@ -76,6 +76,11 @@ class Sky:
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
         self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance) for band in bands]
 
+    @property
+    def bands(self) -> list[_Band]:
+        """The solution at up to four wavelengths each: what tables are baked from."""
+        return self._bands
+
     def rays(
         self,
         altitude_m: Any,
@@ -94,7 +99,7 @@ class Sky:
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun).
         """
-        rays, meets_air, passes = self._enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
+        rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
         for band in self._bands:
@@ -127,8 +132,8 @@ class Sky:
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky
 
-    def _enter(
-        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any
+    def enter(
+        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any = None
     ) -> tuple[Rays, Any, Any]:
         """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether
         they leave for space."""
@@ -210,7 +215,8 @@ def sky(
     ``sun_zenith_deg``, ``view_zenith_deg``, ``azimuth_deg`` and optionally ``distance_m``: numbers or 1-D arrays of
     one length N (see atmo_jit.views). ``orders``: scattering and reflection events counted (None: all, to
     ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the sun's.
-    ``method``: "march" integrates every ray; "auto" chooses. ``progress`` is called with the fraction done.
+    ``method``: "march" integrates every ray, "tables" interpolates them where a table serves, "auto" takes tables where
+    they pay and keep the tolerance. ``progress`` is called with the fraction done.
 
     Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad
     atmosphere, LLVMError without a usable LLVM.
@@ -222,26 +228,47 @@ def sky(
     start = time.perf_counter()
     solved = Sky(air, orders, tolerance)
     solve_seconds = time.perf_counter() - start
-    count = len(checked["altitude_m"])
-    parts = []
-    for first in range(0, count, VIEWS_AT_ONCE):
-        parts.append(
-            _evaluate(solved, {name: v[first : first + VIEWS_AT_ONCE] for name, v in checked.items()}, ground, sun_disc)
+
+    def by_march(some: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        return _march(solved, some, ground, sun_disc, progress)
+
+    if method == "march":
+        arrays, done = by_march(checked), {"method": "march"}
+    else:
+        from .bake.method import evaluate  # builds on this module
+
+        arrays, done = evaluate(
+            solved, checked, method=method, tolerance=tolerance, ground=ground, sun_disc=sun_disc, march=by_march
         )
-        if progress is not None:
-            progress(min(first + VIEWS_AT_ONCE, count) / count)
-    arrays = [np.concatenate(column) for column in zip(*parts, strict=True)]
     meta = {
         "atmo_jit": __version__,
         "seconds": time.perf_counter() - start,
         "solve_seconds": solve_seconds,
         "tolerance": tolerance,
         "orders": orders,
-        "method": "march",
+        **done,
         "wavelengths_nm": air.wavelengths_nm.tolist(),
         "plan": asdict(solved.resolution),
     }
     return SkyResult(*arrays, meta)
+
+
+def _march(
+    solved: Sky,
+    views: Mapping[str, np.ndarray],
+    ground: bool,
+    sun_disc: bool,
+    progress: Callable[[float], None] | None,
+) -> list[np.ndarray]:
+    """The four arrays of a SkyResult by marching, some views at a time."""
+    count = len(views["altitude_m"])
+    parts = []
+    for first in range(0, count, VIEWS_AT_ONCE):
+        part = {name: v[first : first + VIEWS_AT_ONCE] for name, v in views.items()}
+        parts.append(_evaluate(solved, part, ground, sun_disc))
+        if progress is not None:
+            progress(min(first + VIEWS_AT_ONCE, count) / count)
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
 
 def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_disc: bool) -> list[np.ndarray]:

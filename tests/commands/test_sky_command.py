@@ -63,6 +63,18 @@ def read(path):
         return {name: file[name] for name in file.files}
 
 
+@pytest.mark.parametrize("method", ["tables", "march", "auto"])
+def test_method_is_taken_and_told(run, views, tmp_path, method):
+    out = tmp_path / "out.npz"
+    status, *_ = run("--atmosphere", "earth", "--views", views, "--out", out, "--method", method, "--quiet")
+    arrays = read(out)
+    assert status == 0
+    # Three observers: three rays cost less than a table that nobody asked for.
+    assert json.loads(str(arrays["meta"]))["method"] == ("tables" if method == "tables" else "march")
+    exact = atmo_jit.sky("earth", VIEWS, method="march").radiance
+    np.testing.assert_allclose(arrays["radiance"], exact, rtol=1e-2)
+
+
 def test_writes_what_the_contract_says(run, views, tmp_path):
     out = tmp_path / "out.npz"
     status, text, err = run("--atmosphere", "earth", "--views", views, "--out", out)

@@ -1,0 +1,287 @@
+"""The sky of one observer under one sun as a table over elevation and azimuth: two square roots and one packet load per
+look-up.
+
+Latitude is split at the horizon and goes with the square root of the distance to it, azimuth with the sine of its half
+(Hillaire 2020, section 5.3); in place of the elevation stands the sine of its half, which needs no arc functions. A
+cell holds its four corners side by side in half precision.
+
+A forward peak would need many cells. So each peaked scatterer has a channel of its own: its single scattering without
+phase function, the mean over the wavelengths. At look-up that is multiplied by the phase function and by the colour it
+has in the sun's own direction. What it then is wrong elsewhere is part of the other channels, which hold the total
+minus this product: exact at the nodes, and smooth, because the difference vanishes where the peak is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .. import mapping
+from ..backend import floats, packet, padded, parameter, types, uints
+from ..phase import Isotropic, RayleighPhase
+from .mean_source import MeanSource, view_cosines, view_range
+from .sightlines import Sightlines
+from .sunlight import Sunlight
+
+SIZE = (96, 64, 64)  # rows above the horizon, rows below, columns
+# Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
+DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
+SMALLEST_DIP = 0.01  # unit latitude; of an observer some centimetres above the ground
+OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
+LARGEST_HALF = 3e4  # tables are scaled to this: half precision then is exact to 0.05 % over nine decades
+
+
+@dataclass
+class Nodes:
+    """The table's nodes: altitude of the observer (m); unit latitude and cosine of the rows, and which of them look
+    above the horizon; cosines of the columns' azimuths and of the sun."""
+
+    h: float
+    x: np.ndarray
+    mu: np.ndarray
+    up: np.ndarray
+    cos_phi: np.ndarray
+    mu_s: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return len(self.mu), len(self.cos_phi)
+
+    @property
+    def sun_row(self) -> int:
+        """The row above the horizon that is nearest to the sun's elevation."""
+        above = np.flatnonzero(self.up)
+        return int(above[np.argmin(np.abs(self.mu[above] - self.mu_s))])
+
+    @property
+    def nu(self) -> np.ndarray:
+        """Cosine of the angle to the sun, [rows, columns]."""
+        sines = np.sqrt((1.0 - self.mu) * (1.0 + self.mu)) * np.sqrt((1.0 - self.mu_s) * (1.0 + self.mu_s))
+        return np.clip(self.mu[:, None] * self.mu_s + sines[:, None] * self.cos_phi, -1.0, 1.0)
+
+
+@dataclass
+class NodeLight:
+    """Light at the nodes of a table, arrays [rows, columns, C]: ``smooth`` without the single scattering of peaked
+    scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance`` [rows, C]."""
+
+    smooth: np.ndarray
+    peaks: dict[int, np.ndarray]
+    transmittance: np.ndarray
+
+
+class SkyView:
+    """Radiance seen from ``altitude_m`` under a sun at ``sun_zenith`` (rad), with the ground's own unless
+    ``ground=False``.
+
+    ``source``: a solved Sky, or Tables4D to take the light from. ``size``: rows above the horizon, rows below it,
+    columns from the sun's azimuth to the opposite one.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        altitude_m: float,
+        sun_zenith: float,
+        size: tuple[int, int, int] = SIZE,
+        *,
+        ground: bool = True,
+    ) -> None:
+        self.altitude_m, self.sun_zenith, self.size = float(altitude_m), float(sun_zenith), size
+        air = source.atmosphere
+        up_count, down_count, columns = size
+        edge, end = view_range(air.bottom_radius_m, air.thickness_m, np.array(self.altitude_m))
+        # Below the horizon light changes with the distance to the ground, and so on the scale of the horizon's dip.
+        dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
+        crowding = float(1.0 / max(dip, SMALLEST_DIP))
+        below = mapping.crowded_inverse(mapping.texels(down_count), crowding)
+        x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
+        up = np.arange(len(x)) < up_count
+        mu = view_cosines(air.bottom_radius_m, air.thickness_m, np.array([[self.altitude_m]]), x, up)[0]
+        cos_phi = mapping.half_azimuth_inverse(mapping.texels(columns))
+        nodes = Nodes(self.altitude_m, x, mu, up, cos_phi, float(np.cos(sun_zenith)))
+        self._edge = parameter(edge)
+        self._per_range_up, self._per_range_down = (
+            parameter(1.0 / (end - edge)),
+            parameter(1.0 / (edge + mapping.STEEPEST)),
+        )
+        self._limb = bool(end < mapping.STEEPEST)
+        self._crowding, self._up = parameter(crowding), parameter(up_count - 1.0)
+        self._down, self._crowded = parameter(0.5 * (down_count - 1.0)), parameter(1.0 + crowding)
+        self._columns = parameter(columns - 1.0)
+        self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
+        light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
+        self._bands = [_Table.of(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
+
+    def radiance(self, view_zenith: Any, azimuth: Any) -> list[Any]:
+        """W Floats: radiance toward views at these angles (rad), ``azimuth`` from the sun's."""
+        t = types()
+        sine, cosine = dr.sincos(t.Float(view_zenith))
+        sin_phi, cos_phi = dr.sincos(t.Float(azimuth))
+        return self.along(sine * cos_phi, sine * sin_phi, cosine)
+
+    def along(self, x: Any, y: Any, z: Any) -> list[Any]:
+        """The same for unit vectors with z up and the sun above or below the x axis."""
+        square = dr.maximum(dr.fma(x, x, y * y), 1e-24)
+        inverse = dr.rsqrt(square)
+        up, latitude = self._latitude(z, square * inverse)
+        column = dr.sqrt(dr.maximum(dr.fma(x * inverse, -0.5, 0.5), 0.0)) * self._columns
+        nu = dr.fma(z, self._mu_s, x * self._sin_s)
+        row = self._row(up, latitude)
+        found = [v for table in self._bands for v in table.at(up, row, column, nu)]
+        return [dr.select(up & (latitude > 1.0), 0.0, v) for v in found] if self._limb else found
+
+    def transmittance(self, view_zenith: Any) -> list[Any]:
+        """W Floats: transmittance to the ground or out of the air at this view zenith angle (rad)."""
+        sine, cosine = dr.sincos(types().Float(view_zenith))
+        up, latitude = self._latitude(cosine, sine)
+        row = self._row(up, latitude)
+        found = [v for table in self._bands for v in table.through(up, row)]
+        return [dr.select(up & (latitude > 1.0), 1.0, v) for v in found] if self._limb else found
+
+    def _row(self, up: Any, latitude: Any) -> Any:
+        """Fractional row of a half of the table."""
+        x = dr.minimum(latitude, 1.0)
+        below = dr.fma(self._crowded, dr.rcp(dr.fma(x, self._crowding, 1.0)), 1.0) * self._down
+        return x * dr.select(up, self._up, below)
+
+    def _latitude(self, z: Any, across: Any) -> tuple[Any, Any]:
+        """Whether a view of sine ``z`` and cosine ``across`` of elevation looks above the horizon, and its unit
+        latitude: mapping.from_horizon of mapping.half_elevation, with the least arithmetic."""
+        q = dr.fma(z, dr.rsqrt(dr.fma(2.0, across, 2.0)), -self._edge)
+        return q >= 0.0, dr.sqrt(dr.abs(q) * dr.select(q >= 0.0, self._per_range_up, self._per_range_down))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the tables."""
+        return sum(table.nbytes for table in self._bands)
+
+
+class _Table:
+    """One band's cells and the rows of its transmittance."""
+
+    @classmethod
+    def of(cls, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> _Table:
+        """Peaks taken apart, as the module says."""
+        values, colours, greys = light.smooth, [], []
+        nu = floats(nodes.nu)
+        for k, single in light.peaks.items():
+            phase = optics.phase_values(k, nu)
+            dr.eval(phase)
+            value = np.stack([np.broadcast_to(p.numpy(), nodes.nu.size) for p in phase], axis=-1)
+            grey = single.mean(axis=-1)
+            in_sun = single[nodes.sun_row, 0]
+            colour = in_sun / in_sun.mean() if in_sun.mean() > 0.0 else np.zeros_like(in_sun)
+            values = values + (single - grey[..., None] * colour) * value.reshape(single.shape)
+            colours.append([parameter(c) for c in colour])
+            greys.append(grey[..., None])
+        values = np.concatenate([values, *greys], axis=-1)
+        return cls(optics, values, size, list(light.peaks), colours, light.transmittance)
+
+    def __init__(
+        self,
+        optics: Any,
+        values: np.ndarray,
+        size: tuple[int, int, int],
+        peaks: list[int],
+        colours: list[list[Any]],
+        transmittance: np.ndarray,
+    ) -> None:
+        self.optics, self.peaks, self.colours = optics, peaks, colours
+        self.channels = optics.channel_count
+        self.count = 1 << (values.shape[-1] - 1).bit_length()
+        self.up, self.down, self.columns = size
+        largest = float(np.abs(values).max())
+        scale = LARGEST_HALF / largest if largest > 0.0 else 1.0
+        self.unit = parameter(1.0 / scale)
+        # Of every cell the four coefficients of v + v_x x + (v_y + v_xy x) y. Cells beyond the last node of a row or
+        # column are constant: rounding may lead there.
+        v = np.pad(values * scale, ((0, 0), (0, 0), (0, self.count - values.shape[-1])))
+        by_column = np.diff(v, axis=1, append=v[:, -1:])
+        last = np.isin(np.arange(len(v)), (self.up - 1, len(v) - 1))[:, None, None]
+        by_row, by_both = (np.where(last, 0.0, np.diff(a, axis=0, append=a[-1:])) for a in (v, by_column))
+        cells = np.concatenate([v, by_column, by_row, by_both], axis=-1).astype(np.float16)
+        self.cells = types().Float16(np.ascontiguousarray(cells).ravel())
+        extra = ((0, 0), (0, padded(self.channels) - self.channels))
+        self.rows = floats(np.pad(transmittance, extra))
+        dr.eval(self.cells, self.rows)
+        self.nbytes = 2 * dr.width(self.cells) + 4 * dr.width(self.rows)
+
+    def _row(self, up: Any, row: Any) -> tuple[Any, Any]:
+        """First row of the cell (those below the horizon follow those above), and the fraction."""
+        i = types().Int(row)
+        return i + dr.select(up, 0, self.up), row - types().Float(i)
+
+    def at(self, up: Any, row: Any, column: Any, nu: Any) -> list[Any]:
+        """Radiance per channel at a fractional row of either half and a fractional column."""
+        t, n = types(), self.count
+        i, fy = self._row(up, row)
+        j = t.Int(column)
+        fx = column - t.Float(j)
+        cell = t.UInt(dr.fma(i, self.columns, j))
+        c = [t.Float(v) for v in dr.gather(t.ArrayXf16, self.cells, cell, shape=(4 * n, dr.width(cell)))]
+        value = [
+            self.unit * dr.fma(dr.fma(c[3 * n + k], fx, c[2 * n + k]), fy, dr.fma(c[n + k], fx, c[k]))
+            for k in range(self.channels + len(self.peaks))
+        ]
+        radiance = value[: self.channels]
+        for k, grey, colour in zip(self.peaks, value[self.channels :], self.colours, strict=True):
+            phase = self.optics.phase_values(k, nu)
+            radiance = [dr.fma(p * shade, grey, v) for p, shade, v in zip(phase, colour, radiance, strict=True)]
+        return [dr.maximum(v, 0.0) for v in radiance]
+
+    def through(self, up: Any, row: Any) -> list[Any]:
+        t, size = types(), padded(self.channels)
+        i, f = self._row(up, row)
+        after = dr.minimum(i + 1, dr.select(up, self.up, self.up + self.down) - 1)
+        low, high = packet(self.rows, t.UInt(i), size), packet(self.rows, t.UInt(after), size)
+        return [dr.lerp(a, b, f) for a, b in zip(low, high, strict=True)][: self.channels]
+
+
+def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
+    """Light at the nodes from the solution itself, by :class:`Sightlines`: many suns are one here, many azimuths along
+    shared rays take their place."""
+    optics, shape = band.optics, nodes.shape
+    quadrature = DAY_NODES if nodes.mu_s > TWILIGHT else TWILIGHT_NODES
+    lines = Sightlines(optics, np.full(shape[0], nodes.h), nodes.mu, ground=~nodes.up, nodes=quadrature)
+    ray = uints(np.repeat(np.arange(shape[0]), shape[1]))
+    sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
+    sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
+    nu = lines.nu(ray, sun, across)
+    smooth = np.zeros((*shape, optics.channel_count))
+    if ground:  # only rows below the horizon meet it
+        below = np.flatnonzero(~nodes.up)
+        glow_ray = uints(np.repeat(below, shape[1]))
+        glow_across = floats(np.broadcast_to(sin_s * nodes.cos_phi, (len(below), shape[1])))
+        glow = lines.ground_light(band, glow_ray, floats(np.full(glow_across.shape[0], nodes.mu_s)), glow_across)
+        smooth[below] = channels_last(glow, (len(below), shape[1]))
+    if band.source is not None:
+        whole = lines.scattering.reshape(1, *lines.scattering.shape)
+        source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))
+        series = source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0]
+        m = np.arange(series.shape[1])[:, None]
+        smooth = smooth + np.einsum("vmc,mp->vpc", series, np.cos(m * np.arccos(np.clip(nodes.cos_phi, -1.0, 1.0))))
+    peaks = {}
+    singles = lines.single(Sunlight(optics, band.columns), ray, sun, across, nu) if optics.scatterers else []
+    for k, single in zip(optics.scatterers, singles, strict=True):
+        if is_peaked(optics.constituents[k]):
+            peaks[k] = channels_last(single, shape)
+        else:
+            values = zip(single, optics.phase_values(k, nu), strict=True)
+            smooth = smooth + channels_last([s * p for s, p in values], shape)
+    return NodeLight(smooth, peaks, lines.transmittance)
+
+
+def is_peaked(constituent: Any) -> bool:
+    """Whether a scatterer's phase function is kept out of what is interpolated."""
+    return not isinstance(constituent.phase, RayleighPhase | Isotropic)
+
+
+def channels_last(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Floats per channel as one float32 array [*shape, C]."""
+    dr.eval(values)
+    return np.stack([np.broadcast_to(v.numpy(), np.prod(shape)).reshape(shape) for v in values], axis=-1)
