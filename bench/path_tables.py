@@ -28,7 +28,6 @@ SUNS = (10.0, 45.0, 75.0, 88.0, 92.0, 96.0)
 # Altitude (m): zenith angle of the picture's axis and angle across the picture (degrees).
 CAMERAS = {2.0: (0.0, 178.0), 10e3: (90.0, 178.0), 400e3: (180.0, 146.0)}
 AIRS: dict[str, Mapping[str, Any]] = {"earth": {}, "haze": {"mie.scattering_per_m": 5e-5, "mie.phase.g": 0.8}}
-LOW_SUN = 85.0
 BEGIN, END = "<!-- paths against tables: begin -->", "<!-- paths against tables: end -->"
 TEXT = """## Paths against tables
 
@@ -64,7 +63,7 @@ def pictures(air: str, altitude_m: float, sun: float, size: int, samples: int) -
 
     import atmo_jit
     from atmo_jit.plugins.planet import planet
-    from atmo_jit.plugins.rays import trace, tracer_of
+    from atmo_jit.plugins.rays import LOW_SUN_DEG, trace, tracer_of
 
     description = {"solar_irradiance": 1.0, "sun_angular_radius_deg": 0.0}
     atmosphere = atmo_jit.Atmosphere.load("earth").replace({**description, **AIRS[air]})
@@ -76,7 +75,7 @@ def pictures(air: str, altitude_m: float, sun: float, size: int, samples: int) -
     medium = parts.pop("air")
     direction = np.stack([np.sin(v) * np.cos(a), np.sin(v) * np.sin(a), np.cos(v)], axis=-1)
     origin = np.broadcast_to([0.0, 0.0, altitude_m], direction.shape)
-    tracer = tracer_of("atmosphere_volpath", guided=sun > LOW_SUN)
+    tracer = tracer_of("atmosphere_volpath", guided=sun > LOW_SUN_DEG)
     scene = mi.load_dict({"type": "scene", **parts})
     mean, sigma, _ = trace(scene, medium, origin, direction, None, samples, integrator=tracer)
     return {"inside": inside, "paths": mean, "sigma": sigma, "tables": tables}

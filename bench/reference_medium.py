@@ -65,7 +65,13 @@ def agreement(
 
 
 def compare(
-    samples: int, cases: Sequence[int] | None = None, *, single: bool = False, every: int = 1, seed: int = 1
+    samples: int,
+    cases: Sequence[int] | None = None,
+    *,
+    single: bool = False,
+    every: int = 1,
+    seed: int = 1,
+    integrator: str = "atmosphere_volpath",
 ) -> Iterator[Agreement]:
     """Path-trace the rays of ``sky_radiance.npz`` (every so-manyth of each case) in the variant that is set."""
     from atmo_jit.plugins.rays import PathTracedSky
@@ -78,9 +84,9 @@ def compare(
         take = np.arange(len(case.rows))[::every]
         views = {name: values[take] for name, values in case.views.items()}
         rows = case.rows[take]
-        depth = 2 if single else -1
+        tracer = {"integrator": integrator, "max_depth": 2 if single else -1}
         mean, error, hits = PathTracedSky(case.atmosphere).radiance(
-            views, samples, channel=case.channel[take], seed=seed + index, max_depth=depth
+            views, samples, channel=case.channel[take], seed=seed + index, **tracer
         )
         truth, sigma = data["L"][rows], data["L_sigma"][rows]
         if single:
@@ -113,6 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--samples", type=int, default=100_000, help="paths for each ray and wavelength")
     parser.add_argument("--cases", type=int, nargs="*", help="indices of atmospheres (default: all 17)")
     parser.add_argument("--every", type=int, default=1, help="take every so-manyth ray")
+    parser.add_argument("--integrator", default="atmosphere_volpath", help="volpath, volpathmis or prbvolpath")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
 
@@ -127,7 +134,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return efficiency(given.json)
     rows = []
-    for row in compare(given.samples, given.cases, single=given.what == "single", every=given.every):
+    options = {"single": given.what == "single", "every": given.every, "integrator": given.integrator}
+    for row in compare(given.samples, given.cases, **options):
         rows.append(row)
         if not given.json:
             print(line(row), flush=True)

@@ -23,6 +23,7 @@ from .planet import planet
 BATCH = 2**20
 # Deep enough that roulette only ends what has lost nearly everything.
 ROULETTE_DEPTH = 1000
+LOW_SUN_DEG = 85.0  # zenith angle beyond which few paths find the light by themselves
 
 
 def tracer_of(name: str, max_depth: int = -1, **options: Any) -> Any:
@@ -88,11 +89,19 @@ class PathTracedSky:
         self.atmosphere = Atmosphere.load(atmosphere)
 
     def radiance(
-        self, views: Mapping[str, np.ndarray], samples: int, *, channel: np.ndarray | None = None, **options: Any
+        self,
+        views: Mapping[str, np.ndarray],
+        samples: int,
+        *,
+        channel: np.ndarray | None = None,
+        integrator: str = "atmosphere_volpath",
+        max_depth: int = -1,
+        **options: Any,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean (1/sr), standard error and number of samples that were not 0, all [N, W]; options as for :func:`trace`.
 
-        channel: index [N] of the only wavelength that is wanted of each view; the results then are [N].
+        channel: index [N] of the only wavelength that is wanted of each view; the results then are [N]. While the sun
+        is lower than LOW_SUN_DEG the tables guide ``atmosphere_volpath``.
         """
         count = len(self.atmosphere.wavelengths_nm)
         view = {name: np.asarray(values, dtype=np.float64) for name, values in views.items()}
@@ -111,6 +120,7 @@ class PathTracedSky:
             direction = np.stack([np.sin(v) * np.cos(a), np.sin(v) * np.sin(a), np.cos(v)], axis=-1)
             origin = np.stack([0.0 * v, 0.0 * v, view["altitude_m"][rows]], axis=-1)
             repeat = wavelength.shape[1]
+            guided = {"guided": True} if integrator == "atmosphere_volpath" and zenith > LOW_SUN_DEG else {}
             time = (wavelength[rows].ravel() + 0.5) / count
             found = trace(
                 mi.load_dict({"type": "scene", **parts}),
@@ -119,6 +129,7 @@ class PathTracedSky:
                 np.repeat(direction, repeat, axis=0),
                 time,
                 samples,
+                integrator=tracer_of(integrator, max_depth, **guided),
                 **options,
             )
             for result, values in zip(results, (found[0][:, 0], found[1][:, 0], found[2]), strict=True):

@@ -13,6 +13,7 @@ light of a sun with a disc.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,7 @@ from atmo_jit.errors import AtmosphereError, InputError
 
 from . import albedo, settings
 from .planet import light_of, planet
+from .rays import LOW_SUN_DEG
 from .sun import Sun
 from .wavelengths import Wavelengths
 
@@ -32,7 +34,6 @@ REPLACED = ("path", "direct", "volpath", "volpathmis", "atmosphere_path")
 FAR_CLIP = 1e8
 # Paths of this depth are ended by chance: a bounce in the air loses little, so earlier would only add noise.
 ROULETTE_DEPTH = 32
-LOW_SUN = 0.05  # cosine of the zenith angle
 
 
 class AtmosphereSun(Sun):
@@ -133,7 +134,7 @@ def load_reference(load: Callable[[Callable[[Any], None]], Any]) -> Any:
     scene = load(edit)
     parts = planet_of(scene)
     (sun,) = (e for e in scene.emitters() if hasattr(e, "found"))
-    low = float(np.dot(sun.sun_vector, sun.up)) < LOW_SUN
+    low = float(np.dot(sun.sun_vector, sun.up)) < math.cos(math.radians(LOW_SUN_DEG))
 
     def edit_and_add(state: Any) -> None:
         edit(state, low)
