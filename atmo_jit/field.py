@@ -8,25 +8,31 @@ by a factor of two per degree, and linear interpolation of the moments themselve
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, stored, types, uints
+from .backend import floats, packet, padded, row, stored, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
-from .refinement import Order, Refinement
+from .projection import Moments
+from .refinement import Reference, Taps, parity
 
 
 class Field:
-    """The light of a sum of orders at the refined nodes.
+    """The light of a sum of orders, at the altitudes of the grid and the suns of order 1.
 
-    ``first``: order 1, at its own suns; ``rest``: the sum of the later orders that scatter once more (None: there are
-    none), ``arriving``: their sky irradiance [K, S, size], which may be of one order more. ``scatters``: whether any
-    of it scatters once more.
+    ``first``: order 1; ``rest``: the later orders, with weights [len(rest), S, channels] in the sum of those that
+    scatter once more and in that of those that arrive (``arriving``: one order more, where orders are counted).
+    ``scatters``: whether any of it scatters once more.
+
+    ``moments`` [K, suns, pairs, channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
+    channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above;
+    all of them over the reference.
     """
 
     def __init__(
@@ -34,69 +40,154 @@ class Field:
         optics: Optics,
         columns: SunColumns,
         grid: Grid,
-        refine: Refinement,
-        first: Order,
-        rest: Order | None,
-        arriving: Any,
+        reference: Reference,
+        first: Moments,
+        rest: list[Moments],
+        weights: np.ndarray,
+        arriving: np.ndarray,
         *,
         scatters: bool = True,
     ) -> None:
-        self.optics, self.columns, self.grid = optics, columns, grid
-        self.log_reference = refine.log_reference
-        self.scatters = scatters
-        suns = len(grid.first_theta), grid.shape[1]
-        once = refine.both(self._per_depth(first.sky, suns[0]), suns[0])
-        self.sky = once if arriving is None else once + refine.both(self._per_depth(arriving, suns[1]), suns[1])
-        if rest is None:
-            self.reflected = dr.zeros(types().Float, dr.width(self.sky))
-            return
-        self.degree = first.degree
-        self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
-        self.moments = _sum(
-            refine.both(first.moments, suns[0], first.degree),
-            first,
-            refine.both(rest.moments, suns[1], rest.degree),
-            rest,
+        self.optics, self.columns, self.grid, self.reference = optics, columns, grid, reference
+        self.scatters, self.degree = scatters, first.degree
+        self._size = padded(optics.channel_count)
+        entries = pair_count(first.degree)
+        self.moments = self._sum(first, rest, weights, 0, entries)
+        per_depth = self._per_depth()
+        self.reflected = self._over(self._sum(first, rest, weights, entries, 1), per_depth)
+        self.sky = self.reflected
+        if arriving is not weights:
+            self.sky = self._over(self._sum(first, rest, arriving, entries, 1), per_depth)
+
+    def _sum(self, first: Moments, rest: list[Moments], weights: np.ndarray, start: int, entries: int) -> Any:
+        """Quotients [K, first suns, entries, channels] over the reference of the weighed sum of orders, from entry
+        ``start`` of order 1 on."""
+        t, grid, channels = types(), self.grid, self.optics.channel_count
+        suns, few = len(grid.first_theta), grid.shape[1]
+        lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
+        channel, place = lane % channels, lane // channels
+        entry, node = place % entries, place // entries
+        sun, k = node % suns, node // suns
+        total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
+        total = total * dr.gather(t.Float, self.reference.inverse, node * channels + channel)
+        if rest:
+            later = self._rest(rest, weights, first.degree, start, entries)
+            taps = Taps(grid, t.Float(sun) / grid.first, few)
+            places = [((k * few + at) * entries + entry) * channels + channel for at in taps.at]
+            values = [dr.gather(t.Float, later, place) for place in places]
+            total = total + taps.sum(values, dr.gather(t.Float, self._parity(first.degree), start + entry))
+        dr.eval(total)
+        return total
+
+    def _rest(self, rest: list[Moments], weights: np.ndarray, degree: int, start: int, entries: int) -> Any:
+        """The same of the later orders, at their suns [K, S, entries, channels]."""
+        t, grid, channels = types(), self.grid, self.optics.channel_count
+        suns = grid.shape[1]
+        lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
+        channel, place = lane % channels, lane // channels
+        entry, node = place % entries, place // entries
+        sun, k = node % suns, node // suns
+        total = 0.0
+        for order, share in zip(rest, weights, strict=True):
+            there = dr.gather(t.UInt, self._places(degree, order.degree), start + entry)
+            held = there > 0
+            index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
+            weight = dr.gather(t.Float, floats(share), sun * channels + channel)
+            total = dr.fma(dr.gather(t.Float, order.values, index, held), weight, total)
+        total = total * dr.gather(t.Float, self.reference.inverse, self.reference.index(k, sun, channel))
+        dr.eval(total)
+        return total
+
+    def _places(self, degree: int, lower: int) -> Any:
+        """Place + 1 among the entries of a ``lower`` degree for every entry of ``degree``; 0: it is not there."""
+
+        def find() -> Any:
+            stored_pairs = [list(zip(*(a.tolist() for a in pairs(d)), strict=True)) for d in (degree, lower)]
+            place = {pair: i + 1 for i, pair in enumerate(stored_pairs[1])}
+            return uints([*(place.get(pair, 0) for pair in stored_pairs[0]), len(place) + 1])
+
+        return self.grid.kept(("places", degree, lower), find)
+
+    def _parity(self, degree: int) -> Any:
+        return self.grid.kept(("parity", degree), lambda: floats(np.append(parity(pairs(degree)[1]), 1.0)))
+
+    def _refined(self, values: Any, entries: int) -> Any:
+        """[K, first suns, entries, channels] -> [K, sources, entries, size], interpolated cubically."""
+        t, grid, channels = types(), self.grid, self.optics.channel_count
+        suns = len(grid.first_theta)
+        lane = dr.arange(t.UInt, grid.shape[0] * grid.sources * entries)
+        entry, node = lane % entries, lane // entries
+        source, k = node % grid.sources, node // grid.sources
+        taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
+        sign = dr.gather(t.Float, self._parity(self.degree), entry) if entries > 1 else 1.0
+        places = [((k * suns + at) * entries + entry) * channels for at in taps.at]
+        return stored(
+            [taps.sum([dr.gather(t.Float, values, place + c) for place in places], sign) for c in range(channels)],
+            lane,
+            self._size,
         )
-        self._chi = optics.phase_moments(self.degree, padded(optics.channel_count))
+
+    def prepare(self) -> None:
+        """Make the tables for look-ups, which cannot be made while a kernel is traced."""
+        if self.scatters and self.optics.scatterers:
+            dr.eval(self._tables)
+        dr.eval(self._irradiances)
+
+    @cached_property
+    def _tables(self) -> tuple[Any, Any, Any, Any]:
+        """Moments at refined suns for look-ups, phase moments, and the recurrences of harmonics."""
         l_, m = pairs(self.degree)
-        rows = [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
-        self._recurrence, self._l = floats(rows), floats(l_)
-        dr.eval(self.sky, self.reflected, self.moments)
+        rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+        return (
+            self._refined(self.moments, pair_count(self.degree)),
+            self.optics.phase_moments(self.degree),
+            floats(rows),
+            floats(l_),
+        )
+
+    @cached_property
+    def _irradiances(self) -> tuple[Any, Any]:
+        sky = self._refined(self.sky, 1)
+        return sky, sky if self.sky is self.reflected else self._refined(self.reflected, 1)
+
+    def _per_depth(self) -> Any:
+        """1 / scattering depth of the air above, [K, channels]; 0 where there is none."""
+        t, channels = types(), self.optics.channel_count
+        above = self._depth_above(floats(self.grid.h))
+        lane = dr.arange(t.UInt, self.grid.shape[0])
+        out = dr.zeros(t.Float, self.grid.shape[0] * channels)
+        for c, depth in enumerate(above):
+            dr.scatter(out, dr.select(depth > 0.0, 1.0 / dr.select(depth > 0.0, depth, 1.0), 0.0), lane * channels + c)
+        return out
+
+    def _over(self, irradiance: Any, per_depth: Any) -> Any:
+        """Irradiance [K, suns, channels] over the scattering depth of the air above: finite at the top, where both
+        vanish, and smooth up to it."""
+        t, channels = types(), self.optics.channel_count
+        altitudes, width = self.grid.shape[0], len(self.grid.first_theta) * channels
+        lane = dr.arange(t.UInt, altitudes * width)
+        quotient = irradiance * dr.gather(t.Float, per_depth, lane // width * channels + lane % channels)
+        dr.eval(quotient)
+        # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
+        end = altitudes * width - width + lane % width
+        near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * width), 1e-30) for n in (1, 2))
+        steady = near * dr.clip(near / far, 0.25, 4.0)
+        quotient = dr.select(lane >= (altitudes - 1) * width, steady, quotient)
+        dr.eval(quotient)
+        return quotient
 
     def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
         [2][channel]."""
-        suns, size = self.grid.sources, padded(self.optics.channel_count)
+        suns, size = self.grid.sources, 4
         k, fk = self.grid.locate_altitude(h)
         s, fs = self.grid.locate_sun(mu_s)
         first = k * suns + s
         nodes = [first, first + 1, first + suns, first + suns + 1]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
-        logs = [packet(self.log_reference, node, size, active) for node in nodes]
+        logs = [packet(self.reference.fine, node, size, active) for node in nodes]
         channels = range(self.optics.channel_count)
         return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
-
-    def _per_depth(self, irradiance: Any, suns: int) -> Any:
-        """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish,
-        and smooth up to it."""
-        t, size = types(), padded(self.optics.channel_count)
-        altitudes = self.grid.shape[0]
-        above = self._depth_above(floats(self.grid.h))
-        per_altitude = stored(
-            [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above],
-            dr.arange(t.UInt, altitudes),
-            size,
-        )
-        row = suns * size
-        lane = dr.arange(t.UInt, altitudes * row)
-        quotient = irradiance * dr.gather(t.Float, per_altitude, lane // row * size + lane % size)
-        dr.eval(quotient)
-        # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
-        end = altitudes * row - row + lane % row
-        near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * row), 1e-30) for n in (1, 2))
-        steady = near * dr.clip(near / far, 0.25, 4.0)
-        return dr.select(lane >= (altitudes - 1) * row, steady, quotient)
 
     def _depth_above(self, h: Any) -> list[Any]:
         return self.optics.scattering_depths(self.columns.upward(h))
@@ -112,10 +203,10 @@ class Field:
         suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
         s, fs = self.grid.locate_sun(mu_s)
-        buffer = self.reflected if reflected else self.sky
+        buffer = self._irradiances[int(reflected)]
         logs = []
         for node in (k * suns + s, (k + 1) * suns + s):
-            guide = [packet(self.log_reference, node + i, size, active) for i in (0, 1)]
+            guide = [packet(self.reference.fine, node + i, 4, active) for i in (0, 1)]
             values = [packet(buffer, node + i, size, active) for i in (0, 1)]
             logs.append(
                 [
@@ -138,11 +229,12 @@ class Field:
         sine = dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
         count = pair_count(self.degree)
         stride = dr.opaque(t.UInt, count, 1)
+        moments, phases, recurrences, degrees = self._tables
 
         def pair(
             i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]
         ) -> tuple[Any, ...]:
-            a, b, start, is_diagonal = packet(self._recurrence, i, 4, active)
+            a, b, start, is_diagonal = packet(recurrences, i, 4, active)
             new_m = start > 0.0
             diagonal = dr.select(new_m, diagonal * sine * start, diagonal)
             next_cos = dr.select(new_m, 2.0 * cos_phi * cos_m - cos_m1, cos_m)
@@ -150,17 +242,14 @@ class Field:
             value = dr.select(is_diagonal > 0.0, diagonal, a * (mu * last - b * before))
             before = dr.select(is_diagonal > 0.0, 0.0, last)
             basis = value * next_cos
-            corner = [packet(self.moments, node * stride + i, size, active) for node in nodes]
+            corner = [packet(moments, node * stride + i, size, active) for node in nodes]
             moment = [
                 _blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis
                 for c in range(channels)
             ]
-            degree = t.UInt(dr.gather(t.Float, self._l, i, active))
-            chi = packet(self._chi, degree, kinds * size, active)
-            sums = [
-                dr.fma(chi[n], moment[n % size], sums[n]) if n % size < channels else sums[n]
-                for n in range(kinds * size)
-            ]
+            degree = t.UInt(dr.gather(t.Float, degrees, i, active))
+            chi = row(phases, degree, kinds * channels, active=active)
+            sums = [dr.fma(chi[n], moment[n % channels], sums[n]) for n in range(kinds * channels)]
             return i + 1, diagonal, value, before, next_cos, cos_m1, sums
 
         width = dr.width(h)
@@ -174,10 +263,10 @@ class Field:
             zero,
             one,
             cos_phi + zero,
-            [dr.zeros(t.Float, width) for _ in range(kinds * size)],
+            [dr.zeros(t.Float, width) for _ in range(kinds * channels)],
         )
         *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
-        return [[dr.maximum(sums[n * size + c], 0.0) for c in range(channels)] for n in range(kinds)]
+        return [[dr.maximum(sums[n * channels + c], 0.0) for c in range(channels)] for n in range(kinds)]
 
 
 def _blend(weights: list[Any], values: list[Any]) -> Any:
@@ -185,15 +274,3 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
     for weight, value in zip(weights[1:], values[1:], strict=True):
         total = dr.fma(weight, value, total)
     return total
-
-
-def _sum(moments: Any, order: Order, others: Any, other: Order) -> Any:
-    """``moments`` [nodes, pairs, size] of an order plus those of one of equal or lower degree."""
-    t, size = types(), order.size
-    stored_pairs = [list(zip(*(a.tolist() for a in pairs(o.degree)), strict=True)) for o in (order, other)]
-    place = {pair: i for i, pair in enumerate(stored_pairs[1])}
-    source = np.array([place.get(pair, -1) for pair in stored_pairs[0]])
-    lane = dr.arange(t.UInt, dr.width(moments))
-    pair, node = lane // size % len(source), lane // (size * len(source))
-    there, held = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair), dr.gather(t.UInt, uints(source >= 0), pair) > 0
-    return moments + dr.gather(t.Float, others, (node * len(place) + there) * size + lane % size, held)

@@ -16,6 +16,11 @@ def pair_count(degree: int) -> int:
     return (degree + 1) * (degree + 2) // 2
 
 
+def pair_index(degree: int, l_: int, m: int) -> int:
+    """Place of the pair (l, m) among those up to ``degree``."""
+    return m * (2 * degree + 3 - m) // 2 + l_ - m
+
+
 @lru_cache(maxsize=64)
 def pairs(degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Arrays l and m [pair_count(degree)] of the stored order."""

@@ -7,19 +7,18 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 
+from .backend import types
 from .column import SunColumns
 from .field import Field
 from .gather import Gather
 from .grid import Grid
 from .optics import Optics
 from .paths import directions_at
-from .projection import projection
-from .refinement import Order, Refinement, combined
+from .projection import Moments, Projection
+from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
 
@@ -34,43 +33,51 @@ def solve(
     soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
     """
     r, channels = resolution, optics.channel_count
-    fine = directions_at(grid, r.first_up, r.first_down)
     suns = len(grid.first_theta)
-    project = projection(grid, suns, fine, r.first_azimuths, r.first_degree, channels)
-    moments, sky = project(first_order(optics, columns, grid, fine, r))
-    zeroth = Order(moments, sky, r.first_degree, project.size).zeroth()
-    refine = Refinement(grid, zeroth.numpy().reshape(-1, suns, project.size))
-    first = _relative(refine.first_inverse, moments, sky, r.first_degree, project.size)
+    fine = directions_at(grid, r.first_up, r.first_down)
+    project = Projection.at(grid, fine, r.first_degree)
+    first = project(first_order(optics, columns, grid, fine, r), suns, channels)
+    reference = Reference(grid, first)
+    nothing = np.zeros((0, grid.shape[1], channels))
     if orders == 1:
-        return Field(optics, columns, grid, refine, first, None, None, scatters=False)
-    gather = Gather(optics, grid, directions_at(grid, r.up, r.down), r.azimuths)
-    project = projection(grid, grid.shape[1], gather.directions, r.azimuths, r.degree, channels)
-    light, later, held = refine.thinned(first), [], []
-    for _ in range(2, (orders or r.orders) + 1):
-        light = _relative(refine.inverse, *project(gather(refine, light)), r.degree, project.size)
+        return Field(optics, columns, grid, reference, first, [], nothing, nothing, scatters=False)
+    gathers: dict[int, tuple[Gather, Projection]] = {}
+    light, later, probes = first, [], []
+    for n in range(2, (orders or r.orders) + 1):
+        stage = min(n - 2, len(r.stages) - 1)
+        if stage not in gathers:
+            s = r.stages[stage]
+            directions = directions_at(grid, s.up, s.down)
+            gathers[stage] = (
+                Gather(optics, grid, reference, directions, s.azimuths, s.degree, r.nodes),
+                Projection.at(grid, directions, s.degree),
+            )
+        gather, project = gathers[stage]
+        light = project(gather(light), grid.shape[1], channels)
         later.append(light)
-        if orders is None and len(later) >= 3:
-            held += [order.numpy(grid) for order in later[len(held) :]]
-            weights, error = _extrapolated(np.array(held))
+        if orders is None and len(later) >= min(3, r.orders - 1):
+            probes += [_probe(order, grid, reference) for order in later[len(probes) :]]
+            weights, error = _extrapolated(np.array(probes))
             if error < 0.1 * tolerance:
                 break
     if orders is None:
-        rest = combined(later, weights)
-        return Field(optics, columns, grid, refine, first, rest, rest.sky)
-    ones = np.ones((len(later), grid.shape[1], project.size))
-    last = combined(later, ones)
-    ones[-1] = 0.0
-    return Field(optics, columns, grid, refine, first, combined(later, ones), last.sky)
+        return Field(optics, columns, grid, reference, first, later, weights, weights)
+    ones = np.ones((len(later), grid.shape[1], channels))
+    counted = ones.copy()
+    counted[-1] = 0.0
+    return Field(optics, columns, grid, reference, first, later, counted, ones)
 
 
-def _relative(inverse: Any, moments: Any, sky: Any, degree: int, size: int) -> Order:
-    """An order over the reference, whose inverse is given at the order's nodes."""
-    lane = dr.arange(dr.uint32_array_t(type(moments)), dr.width(moments))
-    per_node = dr.width(moments) // dr.width(sky)
-    moments = moments * dr.gather(type(inverse), inverse, lane // (per_node * size) * size + lane % size)
-    sky = sky * inverse
-    dr.eval(moments, sky)
-    return Order(moments, sky, degree, size)
+def _probe(order: Moments, grid: Grid, reference: Reference) -> np.ndarray:
+    """The moments of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
+    t, (altitudes, suns), channels = types(), grid.shape, order.channels
+    lane = dr.arange(t.UInt, altitudes * suns * 2 * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % 2, place // 2
+    sun, k = node % suns, node // suns
+    values = dr.gather(t.Float, dr.detach(order.values), order.index(k, entry, sun, channel))
+    values = values * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+    return values.numpy().reshape(altitudes, suns, 2, channels)
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:

@@ -6,6 +6,8 @@ The rules are measured, not derived: `python -m bench.accuracy` prints what they
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -16,25 +18,34 @@ DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shar
 
 
 @dataclass(frozen=True)
+class Stage:
+    """Directions and azimuths (of the half circle) at a node for an order of scattering, and the ``degree`` of the
+    moments that result."""
+
+    degree: int
+    up: int
+    down: int
+    azimuths: int
+
+
+@dataclass(frozen=True)
 class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
-    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``: parts into
-    which cubic interpolation divides every interval of either. ``up``, ``down``, ``azimuths``: directions at a node
-    for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for order 1, whose forward peak is
-    sharper; ``phase_degree``: that of the phase functions there; ``beam_*``: altitude levels per interval and
-    azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved. ``columns``: size
-    of the sun-column table (altitudes, cosines).
+    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``sun_refine``: parts
+    into which cubic interpolation divides every interval of suns for look-ups. ``stages``: how orders 2, 3, ... are
+    solved, the last serves all that follow; ``nodes``: Gauss points per piece of their paths. ``first_*``: the same
+    for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there; ``beam_*``:
+    altitude levels per interval, azimuths and Gauss points at which sunlight is followed, phase functions apart.
+    ``orders``: most orders solved. ``columns``: size of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
     suns: int = 25
-    refine: tuple[int, int] = (1, 4)
+    sun_refine: int = 4
     first_suns: int = 2
-    up: int = 6
-    down: int = 4
-    azimuths: int = 8
-    degree: int = 4
+    stages: tuple[Stage, ...] = (Stage(4, 6, 4, 6),)
+    nodes: int = 3
     first_up: int = 10
     first_down: int = 8
     first_azimuths: int = 14
@@ -42,6 +53,7 @@ class Resolution:
     phase_degree: int = 16
     beam_refine: int = 6
     beam_azimuths: int = 5
+    beam_nodes: int = 3
     orders: int = 40
     columns: tuple[int, int] = (128, 96)
 
@@ -59,11 +71,9 @@ class Resolution:
         fine = tolerance < 0.005
         return cls(
             altitudes=_altitudes(atmosphere, 16 if fine else 12),
-            refine=(2 if fine else 1, 4),
-            up=later + (4 if later > 6 else 2),
-            down=max(4, (4 * later) // 5 + 2),
-            azimuths=max(later, first // 2) + 1,
-            degree=later,
+            stages=(
+                Stage(later, later + (4 if later > 6 else 2), max(4, (4 * later) // 5 + 2), max(later, first // 2) + 1),
+            ),
             first_up=max(10, first + 2 if first > 12 else first),
             first_down=max(8, first if first > 12 else first - 2),
             first_azimuths=first + 4,
@@ -80,7 +90,7 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
         if constituent.phase is None:
             continue
         # How much of the light they meet these particles scatter.
-        depth = constituent.scattering_per_m * _column(atmosphere, constituent)
+        depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
         share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
         for wavelength in range(len(atmosphere.wavelengths_nm)):
             chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
@@ -92,17 +102,22 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
 
 def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
-    scattering = sum((c.scattering_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    scattering = sum((c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
     extra = 8.0 * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
     return min(clear + 4 * int(np.ceil(extra / 4.0)), 40)
 
 
 def _depth(atmosphere: Atmosphere) -> np.ndarray:
     """Vertical optical depth [W]."""
-    return sum((c.extinction_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    return sum((c.extinction_per_m * column_of(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
 
 
-def _column(atmosphere: Atmosphere, constituent: Constituent) -> float:
+def column_of(atmosphere: Atmosphere, constituent: Constituent) -> float:
     """Vertical column (m) of a constituent's density."""
-    h = atmosphere.thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
-    return float(np.trapezoid(np.asarray(constituent.profile.density(h)), h))
+    return _column(constituent.profile, atmosphere.thickness_m)
+
+
+@lru_cache(maxsize=64)
+def _column(profile: Any, thickness_m: float) -> float:
+    h = thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
+    return float(np.trapezoid(np.asarray(profile.density(h)), h))

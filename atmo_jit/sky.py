@@ -20,7 +20,7 @@ import numpy as np
 from . import __version__
 from .atmosphere import Atmosphere
 from .backend import doubles, types
-from .column import SunColumns
+from .column import sun_columns
 from .errors import InputError
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
@@ -46,11 +46,18 @@ class _Band:
     """The solution at up to four wavelengths."""
 
     def __init__(
-        self, atmosphere: Atmosphere, indices: np.ndarray, resolution: Resolution, orders: int | None, tolerance: float
+        self,
+        atmosphere: Atmosphere,
+        indices: np.ndarray,
+        resolution: Resolution,
+        orders: int | None,
+        tolerance: float,
+        suns: tuple[float, float] | None,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        self.columns = SunColumns(self.optics, resolution.columns)
-        self.field = solve(self.optics, self.columns, Grid.of(atmosphere, resolution), resolution, orders, tolerance)
+        grid = Grid.of(atmosphere, resolution, suns)
+        self.columns = sun_columns(self.optics, grid)
+        self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 
@@ -59,11 +66,17 @@ class Sky:
 
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
-    the resolution follows unless it is given. Raises AtmosphereError, LLVMError, InputError.
+    the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
+    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
-        self, atmosphere: Any, orders: int | None = None, tolerance: float = 0.01, resolution: Resolution | None = None
+        self,
+        atmosphere: Any,
+        orders: int | None = None,
+        tolerance: float = 0.01,
+        resolution: Resolution | None = None,
+        suns: tuple[float, float] | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
@@ -74,7 +87,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance) for band in bands]
+        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
 
     def rays(
         self,
@@ -99,6 +112,7 @@ class Sky:
         disc = self._disc(rays, passes) if sun_disc else None
         for band in self._bands:
             optics = band.optics
+            band.field.prepare()
             light = march(optics, band.columns, rays, source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
@@ -122,6 +136,7 @@ class Sky:
         dr.make_opaque(h, mu_s)
         sun, sky = [], []
         for band in self._bands:
+            band.field.prepare()
             direct, scattered = horizontal_irradiance(band.optics, band.columns, band.field, h, mu_s)
             sun += direct
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
