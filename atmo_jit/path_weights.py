@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from .backend import packet, row, table_of, types
+from .backend import row, table_of, types
 from .optics import Optics
 from .paths import Paths, Points, points_along
 
@@ -45,8 +45,7 @@ def _columns_along(optics: Optics, points: Points) -> Columns:
     part = dr.arange(t.UInt, count // nodes)
     own = [dr.zeros(t.Float, count // nodes) for _ in range(kinds)]
     for g in range(nodes):
-        # Both weights of a point together are its share of the length.
-        weight = sum(packet(d.weights, part * nodes + g, 2))
+        weight = dr.gather(t.Float, d.weight, part * nodes + g)
         own = [dr.fma(weight, v, s) for v, s in zip(row(density, part * nodes + g, kinds), own, strict=True)]
     own = table_of(own, part)
 
@@ -71,8 +70,8 @@ def _columns_along(optics: Optics, points: Points) -> Columns:
 class PathWeights:
     """What every visit of a path contributes to the light at its origin, for one atmosphere; no sun enters.
 
-    Between two stations the field is linear in the altitude coordinate u; each station gets its hat function's share
-    of the integral of density times transmittance over both pieces beside it.
+    Between two stations light is interpolated (paths.Points.shares); each station gets its share of the integral of
+    density times transmittance over the pieces about it.
 
     ``scattered``: table [visits, scatterers x channels], scattering by each; ``reflected``: table [visits, channels],
     transmittance times albedo / pi at the visit where a path ends on the ground, else 0.
@@ -85,11 +84,15 @@ class PathWeights:
         kinds, channels = len(optics.constituents), optics.channel_count
         visit = dr.arange(t.UInt, len(paths.station))
         station = device.station
-        start, middle, stop = (dr.gather(t.UInt, b, station) for b in (d.start, d.middle, d.stop))
+        sharing = points.shares.shape[1]
+        bounds = [dr.gather(t.UInt, d.bounds, station * (sharing + 1) + i) for i in range(sharing + 1)]
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            behind, ahead = packet(d.weights, i, 2)
-            weight = dr.select(i < middle, ahead, behind)
+            # The farther along the path a point lies, the farther behind it this station is.
+            place = t.UInt(sharing - 1)
+            for bound in bounds[1:-1]:
+                place = dr.select(i >= bound, place - 1, place)
+            weight = dr.gather(t.Float, d.weight, i) * dr.gather(t.Float, d.shares, i * sharing + place)
             density, column = row(at.density, i, kinds), row(at.column, i, kinds)
             seen = [dr.exp(-depth) * weight for depth in optics.optical_depths(column)]
             return i + 1, [
@@ -100,7 +103,7 @@ class PathWeights:
 
         sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
         if sums:
-            _, sums = dr.while_loop((start, sums), lambda i, _: i < stop, add, max_iterations=-1, label="weights")
+            _, sums = dr.while_loop((bounds[0] + 0, sums), lambda i, _: i < bounds[-1], add, max_iterations=-1, label="weights")
             self.scattered = table_of([s * device.factor for s in sums], visit)
         depths = [0.0] * channels
         if kinds:

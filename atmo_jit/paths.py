@@ -48,13 +48,17 @@ class Paths:
     ``mu`` (zenith cosine there), ``cos_turn``, ``sin_turn`` (angle about the centre), ``u`` (altitude coordinate in
     levels). Per ray: ``h``, ``mu_start``; ``ground``: it ends on it.
 
-    The field is looked up at visits: one per station on a level, two (the levels below and above) at a perigee. Per
-    visit: its ``station``, ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each
-    ray's visits start.
+    Light is looked up at visits: one per station on a level, two (the levels below and above) at another, a perigee.
+    Per visit: its ``station``, ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each
+    ray's visits start. Where stations off the levels have levels ``of_their_own``, there is one visit per station.
+
+    ``levels`` (m): altitudes of the levels, those of the grid first.
     """
 
     grid: Grid
     refine: int
+    levels: np.ndarray
+    of_their_own: bool
     first: np.ndarray
     ray: np.ndarray
     distance: np.ndarray
@@ -93,7 +97,9 @@ class Paths:
         return len(self.ray)
 
     @classmethod
-    def trace(cls, grid: Grid, h: np.ndarray, mu: np.ndarray, refine: int) -> Paths:
+    def trace(
+        cls, grid: Grid, h: np.ndarray, mu: np.ndarray, refine: int, *, of_their_own: bool = False
+    ) -> Paths:
         """Trace rays from altitudes ``h`` [N] (m) in directions ``mu`` [N] to the ground or the top, with ``refine``
         levels per altitude interval."""
         radius, levels = grid.radius_m, grid.levels_at(refine)
@@ -133,13 +139,21 @@ class Paths:
         u = np.where(np.abs(u - np.round(u)) < ON_LEVEL, np.round(u), u)
         below = np.clip(np.floor(u).astype(int), 0, count - 2)
         share = u - below
-        twice = (share > 0.0) & (share < 1.0)
-        station = np.repeat(np.arange(len(u)), 1 + twice)
-        upper = np.append(False, station[1:] == station[:-1]) | (share == 1.0)[station]
+        apart = (share > 0.0) & (share < 1.0)
+        if of_their_own:
+            station, factor = np.arange(len(u)), np.ones(len(u))
+            level = np.where(apart, count + np.cumsum(apart) - 1, below + (share == 1.0))
+            levels = np.concatenate([levels, np.where(at_perigee, perigee[:, None], h[:, None])[ray, column][apart]])
+        else:
+            station = np.repeat(np.arange(len(u)), 1 + apart)
+            upper = np.append(False, station[1:] == station[:-1]) | (share == 1.0)[station]
+            level, factor = below[station] + upper, np.where(upper, share[station], 1.0 - share[station])
         first = np.concatenate([[0], np.cumsum(reached.sum(axis=1))])
         return cls(
             grid=grid,
             refine=refine,
+            levels=levels,
+            of_their_own=of_their_own,
             first=first,
             ray=ray,
             distance=d,
@@ -151,8 +165,8 @@ class Paths:
             mu_start=mu,
             ground=ground,
             station=station,
-            level=below[station] + upper,
-            factor=np.where(upper, share[station], 1.0 - share[station]),
+            level=level,
+            factor=factor,
             first_visit=np.searchsorted(station, first),
         )
 
@@ -176,10 +190,8 @@ class Paths:
         start = self.distance[follows[piece]] + number * part_length[piece]
         at = start[:, None] + part_length[piece][:, None] * x
         h = self._altitude(np.repeat(ray[piece], nodes), at.ravel())
-        u0, u1 = (np.repeat(self.u[follows[piece] + i], nodes) for i in (0, 1))
-        u = self.refine * self.grid.u_of(h)
-        same = u0 == u1
-        hat = np.where(same, 0.5, np.clip((u - u0) / np.where(same, 1.0, u1 - u0), 0.0, 1.0))
+        behind = np.repeat(follows[piece], nodes)
+        shares = self._cubic_shares(behind, at.ravel()) if self.of_their_own else self._linear_shares(behind, h)
         per_station = np.zeros(self.count, dtype=int)
         per_station[follows] = parts
         first_part = np.concatenate([[0], np.cumsum(per_station)])
@@ -189,10 +201,32 @@ class Paths:
             h=h,
             length=np.repeat(part_length[piece], nodes),
             weight=(part_length[piece][:, None] * w).ravel(),
-            hat=hat,
+            shares=shares,
             first_part=first_part,
             part_ray=ray[piece],
         )
+
+    def _linear_shares(self, behind: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Hat functions in the altitude coordinate: what is solved at the levels is linear in it."""
+        u0, u1, u = self.u[behind], self.u[behind + 1], self.refine * self.grid.u_of(h)
+        same = u0 == u1
+        ahead = np.where(same, 0.5, np.clip((u - u0) / np.where(same, 1.0, u1 - u0), 0.0, 1.0))
+        return np.column_stack([1.0 - ahead, ahead])
+
+    def _cubic_shares(self, behind: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        """Lagrange polynomials in the distance through two stations behind and two ahead, or as many as there are:
+        sunlight is known at the stations alone."""
+        at = behind[:, None] + np.arange(-1, 3)
+        there = np.clip(at, 0, self.count - 1)
+        held = (there == at) & (self.ray[there] == self.ray[behind][:, None])
+        x = np.where(held, self.distance[there], 0.0)
+        shares = np.where(held, 1.0, 0.0)
+        for i in range(4):
+            for j in range(4):
+                if i != j:
+                    gap = np.where(held[:, i] & held[:, j], x[:, i] - x[:, j], 1.0)
+                    shares[:, i] *= np.where(held[:, i] & held[:, j], (distance - x[:, j]) / gap, 1.0)
+        return shares
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
         radius = self.grid.radius_m
@@ -206,8 +240,9 @@ class Paths:
 class Points:
     """Gauss points along paths, in sets of ``nodes``: one set for every part of a piece.
 
-    Per point: altitude ``h`` (m), ``length`` of its part (m), ``weight`` (m), ``hat``: the share of the station ahead
-    in what happens there. ``first_part`` [T + 1]: where the parts of the piece after each station start; ``part_ray``.
+    Per point: altitude ``h`` (m), ``length`` of its part and ``weight`` (m), and the ``shares`` [points, 2 or 4] that
+    stations have in what happens there: the ones behind and ahead, or two of each. ``first_part`` [T + 1]: where the
+    parts of the piece after each station start; ``part_ray``.
     """
 
     paths: Paths
@@ -215,26 +250,26 @@ class Points:
     h: np.ndarray
     length: np.ndarray
     weight: np.ndarray
-    hat: np.ndarray
+    shares: np.ndarray
     first_part: np.ndarray
     part_ray: np.ndarray
 
     @cached_property
     def device(self) -> SimpleNamespace:
-        """What kernels read: per point ``h``, ``length``, ``weights`` [points, 2] (those of the stations behind and
-        ahead); per part ``first`` (first part of its ray); per station ``start``, ``middle``, ``stop``: points that
-        count for it, from the piece before it and the one after; per ray ``ray_parts`` [N, 2]."""
+        """What kernels read: per point ``h``, ``length``, ``weight``, ``shares``; per part ``first`` (first part of its
+        ray); per station ``bounds`` [T, shares + 1]: where the points begin for which it is the last of the stations
+        that share, the last but one, ..., and where they end; per ray ``ray_parts`` [N, 2]; ``running`` integrals."""
         paths = self.paths
-        per_ray = self.first_part[paths.first]
-        before = np.maximum(np.arange(paths.count) - 1, paths.first[paths.ray])
+        per_ray, reach = self.first_part[paths.first], self.shares.shape[1] // 2
+        station = np.arange(paths.count)[:, None] + np.arange(-reach, reach + 1)
+        within = np.clip(station, paths.first[paths.ray][:, None], paths.first[paths.ray + 1][:, None])
         return SimpleNamespace(
             h=floats(self.h),
             length=floats(self.length),
-            weights=floats(np.column_stack([self.weight * (1.0 - self.hat), self.weight * self.hat])),
+            weight=floats(self.weight),
+            shares=floats(self.shares),
             first=uints(per_ray[self.part_ray]),
-            start=uints(self.nodes * self.first_part[before]),
-            middle=uints(self.nodes * self.first_part[:-1]),
-            stop=uints(self.nodes * self.first_part[1:]),
+            bounds=uints(self.nodes * self.first_part[within]),
             ray_parts=uints(np.column_stack([per_ray[:-1], per_ray[1:]])),
             running=table(running_integral(self.nodes, tuple(gauss_legendre(self.nodes)[0].tolist()))),
         )
@@ -245,13 +280,14 @@ def directions_at(grid: Grid, up: int, down: int) -> Directions:
     return grid.kept(("directions", up, down), lambda: Directions.at_nodes(grid, up, down))
 
 
-def paths_along(grid: Grid, directions: Directions, refine: int) -> Paths:
+def paths_along(grid: Grid, directions: Directions, refine: int, *, of_their_own: bool = False) -> Paths:
     """Paths along the directions at the solved altitudes, kept with the grid."""
 
     def trace() -> Paths:
-        return Paths.trace(grid, np.repeat(grid.h, directions.mu.shape[1]), directions.mu.ravel(), refine)
+        h, mu = np.repeat(grid.h, directions.mu.shape[1]), directions.mu.ravel()
+        return Paths.trace(grid, h, mu, refine, of_their_own=of_their_own)
 
-    return grid.kept(("paths", directions, refine), trace)
+    return grid.kept(("paths", directions, refine, of_their_own), trace)
 
 
 def points_along(paths: Paths, nodes: int) -> Points:

@@ -22,7 +22,7 @@ from .resolution import Resolution
 
 
 class Sunbeam:
-    """Direct sunlight at altitude levels: transmittance toward the sun times the visible part of its disc, linear in
+    """Direct sunlight at the levels of paths: transmittance toward the sun times the visible part of its disc, linear in
     mu_s.
 
     ``table`` [levels, COSINES, size]: from the lowest mu_s at which the top still sees the sun up to 1.
@@ -30,7 +30,7 @@ class Sunbeam:
 
     COSINES = 768
 
-    def __init__(self, optics: Optics, columns: SunColumns, grid: Grid, refine: int) -> None:
+    def __init__(self, optics: Optics, columns: SunColumns, paths: Paths) -> None:
         t = types()
         self.optics, self.size = optics, padded(optics.channel_count)
         radius, top = optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m
@@ -40,9 +40,8 @@ class Sunbeam:
         kinds = len(optics.constituents)
 
         def beams() -> Any:
-            levels = grid.levels_at(refine)
-            lane = dr.arange(t.UInt, len(levels) * self.COSINES)
-            h = dr.gather(t.Float, floats(levels), lane // self.COSINES)
+            lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
+            h = dr.gather(t.Float, floats(paths.levels), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
             seen = visible_sun(optics, h, optics.radius + h, mu_s)
             return table_of([seen, *columns.toward(h, mu_s)], lane)
@@ -50,7 +49,7 @@ class Sunbeam:
         if optics.profiles_differentiable:
             held = beams()
         else:
-            held = grid.kept(("sunbeams", refine), beams)
+            held = paths.grid.kept(("sunbeams", paths), beams)
         lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
         seen, *column = row(held, lane, 1 + kinds)
         depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
@@ -78,9 +77,9 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
     sun. Phase functions are smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed
     by them.
     """
-    paths = paths_along(grid, directions, r.beam_refine)
+    paths = paths_along(grid, directions, r.beam_refine, of_their_own=True)
     weights = PathWeights(optics, paths, r.beam_nodes)
-    beam = Sunbeam(optics, columns, grid, r.beam_refine)
+    beam = Sunbeam(optics, columns, paths)
     glow = _beam_along(optics, beam, paths, weights, grid, r.beam_azimuths)
     return _times_phase(optics, *glow, grid, directions, r)
 
