@@ -14,25 +14,21 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, row, stored, types, uints
+from .backend import floats, packet, padded, row, row_size, stored, table_of, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
 from .projection import Moments
-from .refinement import Reference, Taps, parity
+from .refinement import Reference, Taps
 
 
 class Field:
-    """The light of a sum of orders, at the altitudes of the grid and the suns of order 1.
+    """The light of a sum of orders, at the altitudes of the grid and the suns of order 1, over the reference.
 
-    ``first``: order 1; ``rest``: the later orders, with weights [len(rest), S, channels] in the sum of those that
-    scatter once more and in that of those that arrive (``arriving``: one order more, where orders are counted).
+    ``moments`` [K, suns, pairs(degree), channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
+    channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above.
     ``scatters``: whether any of it scatters once more.
-
-    ``moments`` [K, suns, pairs, channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
-    channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above;
-    all of them over the reference.
     """
 
     def __init__(
@@ -41,75 +37,17 @@ class Field:
         columns: SunColumns,
         grid: Grid,
         reference: Reference,
-        first: Moments,
-        rest: list[Moments],
-        weights: np.ndarray,
-        arriving: np.ndarray,
+        degree: int,
+        moments: Any,
+        sky: Any,
+        reflected: Any,
         *,
         scatters: bool = True,
     ) -> None:
         self.optics, self.columns, self.grid, self.reference = optics, columns, grid, reference
-        self.scatters, self.degree = scatters, first.degree
+        self.degree, self.moments, self.sky, self.reflected = degree, moments, sky, reflected
+        self.scatters = scatters
         self._size = padded(optics.channel_count)
-        entries = pair_count(first.degree)
-        self.moments = self._sum(first, rest, weights, 0, entries)
-        per_depth = self._per_depth()
-        self.reflected = self._over(self._sum(first, rest, weights, entries, 1), per_depth)
-        self.sky = self.reflected
-        if arriving is not weights:
-            self.sky = self._over(self._sum(first, rest, arriving, entries, 1), per_depth)
-
-    def _sum(self, first: Moments, rest: list[Moments], weights: np.ndarray, start: int, entries: int) -> Any:
-        """Quotients [K, first suns, entries, channels] over the reference of the weighed sum of orders, from entry
-        ``start`` of order 1 on."""
-        t, grid, channels = types(), self.grid, self.optics.channel_count
-        suns, few = len(grid.first_theta), grid.shape[1]
-        lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
-        channel, place = lane % channels, lane // channels
-        entry, node = place % entries, place // entries
-        sun, k = node % suns, node // suns
-        total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
-        total = total * dr.gather(t.Float, self.reference.inverse, node * channels + channel)
-        if rest:
-            later = self._rest(rest, weights, first.degree, start, entries)
-            taps = Taps(grid, t.Float(sun) / grid.first, few)
-            places = [((k * few + at) * entries + entry) * channels + channel for at in taps.at]
-            values = [dr.gather(t.Float, later, place) for place in places]
-            total = total + taps.sum(values, dr.gather(t.Float, self._parity(first.degree), start + entry))
-        dr.eval(total)
-        return total
-
-    def _rest(self, rest: list[Moments], weights: np.ndarray, degree: int, start: int, entries: int) -> Any:
-        """The same of the later orders, at their suns [K, S, entries, channels]."""
-        t, grid, channels = types(), self.grid, self.optics.channel_count
-        suns = grid.shape[1]
-        lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
-        channel, place = lane % channels, lane // channels
-        entry, node = place % entries, place // entries
-        sun, k = node % suns, node // suns
-        total = 0.0
-        for order, share in zip(rest, weights, strict=True):
-            there = dr.gather(t.UInt, self._places(degree, order.degree), start + entry)
-            held = there > 0
-            index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
-            weight = dr.gather(t.Float, floats(share), sun * channels + channel)
-            total = dr.fma(dr.gather(t.Float, order.values, index, held), weight, total)
-        total = total * dr.gather(t.Float, self.reference.inverse, self.reference.index(k, sun, channel))
-        dr.eval(total)
-        return total
-
-    def _places(self, degree: int, lower: int) -> Any:
-        """Place + 1 among the entries of a ``lower`` degree for every entry of ``degree``; 0: it is not there."""
-
-        def find() -> Any:
-            stored_pairs = [list(zip(*(a.tolist() for a in pairs(d)), strict=True)) for d in (degree, lower)]
-            place = {pair: i + 1 for i, pair in enumerate(stored_pairs[1])}
-            return uints([*(place.get(pair, 0) for pair in stored_pairs[0]), len(place) + 1])
-
-        return self.grid.kept(("places", degree, lower), find)
-
-    def _parity(self, degree: int) -> Any:
-        return self.grid.kept(("parity", degree), lambda: floats(np.append(parity(pairs(degree)[1]), 1.0)))
 
     def _refined(self, values: Any, entries: int) -> Any:
         """[K, first suns, entries, channels] -> [K, sources, entries, size], interpolated cubically."""
@@ -119,7 +57,7 @@ class Field:
         entry, node = lane % entries, lane // entries
         source, k = node % grid.sources, node // grid.sources
         taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
-        sign = dr.gather(t.Float, self._parity(self.degree), entry) if entries > 1 else 1.0
+        sign = dr.gather(t.Float, _parity(grid, self.degree), entry) if entries > 1 else 1.0
         places = [((k * suns + at) * entries + entry) * channels for at in taps.at]
         return stored(
             [taps.sum([dr.gather(t.Float, values, place + c) for place in places], sign) for c in range(channels)],
@@ -147,50 +85,7 @@ class Field:
 
     @cached_property
     def _irradiances(self) -> tuple[Any, Any]:
-        sky = self._refined(self.sky, 1)
-        return sky, sky if self.sky is self.reflected else self._refined(self.reflected, 1)
-
-    def _per_depth(self) -> Any:
-        """1 / scattering depth of the air above, [K, channels]; 0 where there is none."""
-        t, channels = types(), self.optics.channel_count
-        above = self._depth_above(floats(self.grid.h))
-        lane = dr.arange(t.UInt, self.grid.shape[0])
-        out = dr.zeros(t.Float, self.grid.shape[0] * channels)
-        for c, depth in enumerate(above):
-            dr.scatter(out, dr.select(depth > 0.0, 1.0 / dr.select(depth > 0.0, depth, 1.0), 0.0), lane * channels + c)
-        return out
-
-    def _over(self, irradiance: Any, per_depth: Any) -> Any:
-        """Irradiance [K, suns, channels] over the scattering depth of the air above: finite at the top, where both
-        vanish, and smooth up to it."""
-        t, channels = types(), self.optics.channel_count
-        altitudes, width = self.grid.shape[0], len(self.grid.first_theta) * channels
-        lane = dr.arange(t.UInt, altitudes * width)
-        quotient = irradiance * dr.gather(t.Float, per_depth, lane // width * channels + lane % channels)
-        dr.eval(quotient)
-        # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
-        end = altitudes * width - width + lane % width
-        near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * width), 1e-30) for n in (1, 2))
-        steady = near * dr.clip(near / far, 0.25, 4.0)
-        quotient = dr.select(lane >= (altitudes - 1) * width, steady, quotient)
-        dr.eval(quotient)
-        return quotient
-
-    def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
-        """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
-        [2][channel]."""
-        suns, size = self.grid.sources, 4
-        k, fk = self.grid.locate_altitude(h)
-        s, fs = self.grid.locate_sun(mu_s)
-        first = k * suns + s
-        nodes = [first, first + 1, first + suns, first + suns + 1]
-        weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
-        logs = [packet(self.reference.fine, node, size, active) for node in nodes]
-        channels = range(self.optics.channel_count)
-        return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
-
-    def _depth_above(self, h: Any) -> list[Any]:
-        return self.optics.scattering_depths(self.columns.upward(h))
+        return self._refined(self.sky, 1), self._refined(self.reflected, 1)
 
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
@@ -216,7 +111,7 @@ class Field:
                 ]
             )
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
-        above = self._depth_above(h)
+        above = self.optics.scattering_depths(self.columns.upward(h))
         return [dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
@@ -274,3 +169,112 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
     for weight, value in zip(weights[1:], values[1:], strict=True):
         total = dr.fma(weight, value, total)
     return total
+
+
+def total_of(
+    optics: Optics,
+    columns: SunColumns,
+    grid: Grid,
+    reference: Reference,
+    first: Moments,
+    rest: list[Moments],
+    shares: list[tuple[Any, Any]],
+) -> tuple[Any, Any, Any]:
+    """Moments, sky and reflected irradiance of a Field from order 1 and the later ones.
+
+    ``shares``, per later order: what it counts [S, channels] in the light that scatters or reflects once more, and in
+    the light that arrives.
+    """
+    counted, arriving = ([pair[i] for pair in shares] for i in (0, 1))
+    entries = pair_count(first.degree)
+    per_depth = _per_depth(optics, columns, grid)
+    return (
+        _sum(grid, reference, first, rest, counted, 0, entries),
+        _over(grid, _sum(grid, reference, first, rest, arriving, entries, 1), per_depth, first.channels),
+        _over(grid, _sum(grid, reference, first, rest, counted, entries, 1), per_depth, first.channels),
+    )
+
+
+def _sum(
+    grid: Grid, reference: Reference, first: Moments, rest: list[Moments], shares: list[Any], start: int, entries: int
+) -> Any:
+    """Quotients [K, first suns, entries, channels] over the reference of the weighed sum of orders, from entry
+    ``start`` of order 1 on."""
+    t, channels = types(), first.channels
+    suns, few = len(grid.first_theta), grid.shape[1]
+    lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % entries, place // entries
+    sun, k = node % suns, node // suns
+    total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
+    total = total * dr.gather(t.Float, reference.inverse, node * channels + channel)
+    if rest:
+        later = _rest(grid, reference, first.degree, rest, shares, start, entries)
+        taps = Taps(grid, t.Float(sun) / grid.first, few)
+        values = [
+            dr.gather(t.Float, later, ((k * few + at) * entries + entry) * channels + channel) for at in taps.at
+        ]
+        total = total + taps.sum(values, dr.gather(t.Float, _parity(grid, first.degree), start + entry))
+    dr.eval(total)
+    return total
+
+
+def _rest(
+    grid: Grid, reference: Reference, degree: int, rest: list[Moments], shares: list[Any], start: int, entries: int
+) -> Any:
+    """The same of the later orders, at their suns [K, S, entries, channels]."""
+    t, channels, suns = types(), rest[0].channels, grid.shape[1]
+    lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % entries, place // entries
+    sun, k = node % suns, node // suns
+    total = 0.0
+    for order, share in zip(rest, shares, strict=True):
+        there = dr.gather(t.UInt, _places(grid, degree, order.degree), start + entry)
+        held = there > 0
+        index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
+        weight = dr.gather(t.Float, share, sun * channels + channel)
+        total = dr.fma(dr.gather(t.Float, order.values, index, held), weight, total)
+    total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+    dr.eval(total)
+    return total
+
+
+def _places(grid: Grid, degree: int, lower: int) -> Any:
+    """Place + 1 among the entries of a ``lower`` degree for every entry of ``degree``; 0: it is not there."""
+
+    def find() -> Any:
+        stored_pairs = [list(zip(*(a.tolist() for a in pairs(d)), strict=True)) for d in (degree, lower)]
+        place = {pair: i + 1 for i, pair in enumerate(stored_pairs[1])}
+        return uints([*(place.get(pair, 0) for pair in stored_pairs[0]), len(place) + 1])
+
+    return grid.kept(("places", degree, lower), find)
+
+
+def _parity(grid: Grid, degree: int) -> Any:
+    """(-1)^m of every entry."""
+    return grid.kept(("parity", degree), lambda: floats(np.append(1.0 - 2.0 * (pairs(degree)[1] % 2), 1.0)))
+
+
+def _per_depth(optics: Optics, columns: SunColumns, grid: Grid) -> Any:
+    """1 / scattering depth of the air above, table [K, channels]; 0 where there is none."""
+    above = optics.scattering_depths(columns.upward(grid.kept("altitudes", lambda: floats(grid.h))))
+    inverse = [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above]
+    return table_of(inverse, dr.arange(types().UInt, grid.shape[0]))
+
+
+def _over(grid: Grid, irradiance: Any, per_depth: Any, channels: int) -> Any:
+    """Irradiance [K, suns, channels] over the scattering depth of the air above: finite at the top, where both vanish,
+    and smooth up to it."""
+    t = types()
+    altitudes, width = grid.shape[0], len(grid.first_theta) * channels
+    lane = dr.arange(t.UInt, altitudes * width)
+    quotient = irradiance * dr.gather(t.Float, per_depth, lane // width * row_size(channels) + lane % channels)
+    dr.eval(quotient)
+    # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
+    end = altitudes * width - width + lane % width
+    near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * width), 1e-30) for n in (1, 2))
+    steady = near * dr.clip(near / far, 0.25, 4.0)
+    quotient = dr.select(lane >= (altitudes - 1) * width, steady, quotient)
+    dr.eval(quotient)
+    return quotient

@@ -57,8 +57,8 @@ class Samples:
 
 
 class Gather:
-    """The step from one order to the next for one atmosphere, along ``directions`` seen at ``azimuths``; the radiance
-    that it returns is of degree ``degree``."""
+    """The step from one order to the next for one atmosphere, along ``directions`` seen at ``azimuths``; the light that
+    it returns is of degree ``degree``. ``held``: what another of the same kind made of the atmosphere."""
 
     def __init__(
         self,
@@ -69,14 +69,18 @@ class Gather:
         azimuths: int,
         degree: int,
         nodes: int,
+        held: dict[str, Any] | None = None,
     ) -> None:
         self.optics, self.grid, self.reference = optics, grid, reference
         self.azimuths, self.degree = azimuths, degree
         key = ("samples", directions, azimuths)
         self.samples = grid.kept(key, lambda: Samples(grid, directions, azimuths))
         self.paths = self.samples.paths
-        self.weights = PathWeights(optics, self.paths, nodes)
-        self._scale = self._reference_at_samples()
+        if held is None:
+            weights = PathWeights(optics, self.paths, nodes)
+            scale = self._reference_at_samples()
+            held = {"scattered": weights.scattered, "reflected": weights.reflected, "scale": scale}
+        self.held = held
 
     def _reference_at_samples(self) -> Any:
         """The reference at every sample, [visits, S, azimuths, 4]."""
@@ -99,7 +103,7 @@ class Gather:
         def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             place = i * per_visit + sample
             x, cos_phi = packet(self.samples.place, place, 2)
-            scale = packet(self._scale, place, 4)
+            scale = packet(self.held["scale"], place, 4)
             s = dr.minimum(t.UInt(x), suns - 2)
             taps = cubic(x - t.Float(s))
             # The table has one more sun before the first and after the last.
@@ -185,14 +189,14 @@ class Gather:
         l_, visit = lane % rows, lane // rows
         products = [0.0] * channels
         if kinds:
-            weight, moment = row(self.weights.scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
+            weight, moment = row(self.held["scattered"], visit, kinds * channels), row(chi, l_, kinds * channels)
             for n in range(kinds):
                 products = [
                     dr.fma(weight[n * channels + c], moment[n * channels + c], products[c]) for c in range(channels)
                 ]
         values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
         last = l_ == rows - 1
-        reflected = row(self.weights.reflected, visit, channels, active=last)
+        reflected = row(self.held["reflected"], visit, channels, active=last)
         values[:channels] = [dr.select(last, r, v) for r, v in zip(reflected, values, strict=False)]
         return table_of(values, lane)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -73,6 +74,12 @@ class Grid:
         if key not in self._kept:
             self._kept[key] = make()
         return self._kept[key]
+
+    def arrays(self) -> list[Any]:
+        """Every Dr.Jit array that is kept, once."""
+        found: dict[int, Any] = {}
+        _collect(vars(self), found, set())
+        return list(found.values())
 
     def _place_altitudes(self, atmosphere: Atmosphere, count: int) -> None:
         # Samples dense near the ground, so that a thin layer there is resolved too.
@@ -180,6 +187,23 @@ class Grid:
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
         """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
         return _split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
+
+
+def _collect(value: Any, found: dict[int, Any], seen: set[int]) -> None:
+    """Put the Dr.Jit arrays within containers and objects of this package into ``found``."""
+    if dr.is_array_v(value):
+        found.setdefault(value.index, value)
+    elif id(value) not in seen:
+        seen.add(id(value))
+        if isinstance(value, dict):
+            parts = list(value.values())
+        elif isinstance(value, (list, tuple)):
+            parts = value
+        else:
+            ours = isinstance(value, SimpleNamespace) or type(value).__module__.startswith(__package__)
+            parts = list(vars(value).values()) if ours and hasattr(value, "__dict__") else []
+        for part in parts:
+            _collect(part, found, seen)
 
 
 def _matter(atmosphere: Atmosphere, constituent: Constituent) -> tuple[bool, int]:

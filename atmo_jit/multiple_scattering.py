@@ -7,12 +7,15 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
-from .backend import types
+from .backend import floats, types
 from .column import SunColumns
-from .field import Field
+from .field import Field, total_of
 from .gather import Gather
 from .grid import Grid
 from .optics import Optics
@@ -21,6 +24,8 @@ from .projection import Moments, Projection
 from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
+
+AT_ONCE = 3  # orders computed before the sum is first extrapolated
 
 
 def solve(
@@ -32,43 +37,157 @@ def solve(
     ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
     soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
     """
-    r, channels = resolution, optics.channel_count
-    suns = len(grid.first_theta)
-    fine = directions_at(grid, r.first_up, r.first_down)
-    project = Projection.at(grid, fine, r.first_degree)
-    first = project(first_order(optics, columns, grid, fine, r), suns, channels)
-    reference = Reference(grid, first)
-    nothing = np.zeros((0, grid.shape[1], channels))
-    if orders == 1:
-        return Field(optics, columns, grid, reference, first, [], nothing, nothing, scatters=False)
-    gathers: dict[int, tuple[Gather, Projection]] = {}
-    light, later, probes = first, [], []
-    for n in range(2, (orders or r.orders) + 1):
-        stage = min(n - 2, len(r.stages) - 1)
-        if stage not in gathers:
-            s = r.stages[stage]
-            directions = directions_at(grid, s.up, s.down)
-            gathers[stage] = (
-                Gather(optics, grid, reference, directions, s.azimuths, s.degree, r.nodes),
-                Projection.at(grid, directions, s.degree),
-            )
-        gather, project = gathers[stage]
-        light = project(gather(light), grid.shape[1], channels)
-        later.append(light)
-        if orders is None and len(later) >= min(3, r.orders - 1):
-            probes += [_probe(order, grid, reference) for order in later[len(probes) :]]
-            weights, error = _extrapolated(np.array(probes))
-            if error < 0.1 * tolerance:
+    steps = _Steps.of(optics, columns, grid, resolution)
+    most = orders or resolution.orders
+    values = optics.values(resolution.degrees, resolution.phase_degree)
+    done = steps.start(values, min(AT_ONCE, most))
+    later, probes = done["later"], [p.numpy() for p in done["probes"]]
+    weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
+    for n in range(AT_ONCE, most + 1):
+        if orders is None and later:
+            shape = (len(probes), grid.shape[0], grid.shape[1], 2, optics.channel_count)
+            weights, error = _extrapolated(np.reshape(probes, shape))
+            arriving = weights
+            if error < resolution.converged * tolerance:
                 break
-    if orders is None:
-        return Field(optics, columns, grid, reference, first, later, weights, weights)
-    ones = np.ones((len(later), grid.shape[1], channels))
-    counted = ones.copy()
-    counted[-1] = 0.0
-    return Field(optics, columns, grid, reference, first, later, counted, ones)
+        if n == most:
+            break
+        light, probe = steps.step(values, done, later[-1], n + 1)
+        later.append(light)
+        probes.append(probe.numpy())
+    if orders is not None and later:
+        arriving = np.ones((len(later), grid.shape[1], optics.channel_count))
+        weights = arriving.copy()
+        weights[-1] = 0.0
+    shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
+    parts = steps.finish(values, done, later, shares)
+    reference = Reference.of(grid, optics.channel_count, done["reference"])
+    return Field(optics, columns, grid, reference, resolution.first_degree, *parts, scatters=orders != 1)
 
 
-def _probe(order: Moments, grid: Grid, reference: Reference) -> np.ndarray:
+class _Steps:
+    """The parts of a solve as functions of an atmosphere's values alone.
+
+    Everything else is geometry that stays with the grid. A solve is a hundred small kernels, and tracing them costs
+    more than running them; so from the second solve on a grid on they are recorded (dr.freeze) and played back. Not
+    so where derivatives are wanted: they do not pass through a recording.
+    """
+
+    def __init__(self, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> None:
+        self._optics, self._columns, self._grid, self._resolution = optics, columns, grid, resolution
+        self._stages = [directions_at(grid, s.up, s.down) for s in resolution.stages]
+        self._recorded: dict[Any, Callable[..., Any]] = {}
+        self._used: set[Any] = set()
+
+    @classmethod
+    def of(cls, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> _Steps:
+        """Those kept with the grid for atmospheres of this make-up, unless the profiles carry derivatives."""
+        if optics.profiles_differentiable:
+            return cls(optics, columns, grid, resolution)
+        return grid.kept(("steps", optics.make_up), lambda: cls(optics, columns, grid, resolution))
+
+    def start(self, values: Any, count: int) -> dict[str, Any]:
+        """Orders 1 to ``count``, the reference, and what the next order needs."""
+        return self._run(("start", count), lambda v: self._start(v, count), values)
+
+    def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> tuple[Any, Any]:
+        """Order ``n`` from the one before, and its probe."""
+        stage, before = self._stage(n), self._stage(n - 1)
+        if stage != before or n == 2:
+            done["gather"] = None
+        key = ("step", stage, before, n == 2, done["gather"] is None)
+        light, probe, done["gather"] = self._run(
+            key,
+            lambda v, reference, gather, light: self._step(v, reference, gather, light, n),
+            values,
+            done["reference"],
+            done["gather"],
+            light,
+        )
+        return light, probe
+
+    def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
+        """What Field holds: moments, sky and reflected irradiance."""
+        return self._run(
+            ("finish", len(later)),
+            lambda v, reference, first, later, shares: self._finish(v, reference, first, later, shares),
+            values,
+            done["reference"],
+            done["first"],
+            later,
+            shares,
+        )
+
+    def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        if self._optics.profiles_differentiable or _differentiable(arguments):
+            return function(*arguments)
+        if key in self._recorded:
+            return self._recorded[key](*arguments)
+        if key in self._used:
+            arrays = self._grid.arrays()
+            self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
+            return self._recorded[key](*arguments)
+        self._used.add(key)
+        return function(*arguments)
+
+    def _stage(self, n: int) -> int:
+        return min(n - 2, len(self._stages) - 1)
+
+    def _degree(self, n: int) -> int:
+        return self._resolution.first_degree if n == 1 else self._resolution.stages[self._stage(n)].degree
+
+    def _start(self, values: Any, count: int) -> dict[str, Any]:
+        optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
+        suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
+        project = Projection.at(grid, fine, r.first_degree)
+        first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
+        reference = Reference.above(grid, first)
+        later, probes, light, gather = [], [], first, None
+        for n in range(2, count + 1):
+            if n > 2 and self._stage(n) != self._stage(n - 1):
+                gather = None
+            gather = gather or self._gather(optics, reference, n, None)
+            light = self._next(gather, light, n)
+            later.append(light.values)
+            probes.append(_probe(light, grid, reference))
+        held = gather and gather.held
+        return {"first": first.values, "reference": reference.held, "later": later, "probes": probes, "gather": held}
+
+    def _step(self, values: Any, reference: Any, gather: Any, light: Any, n: int) -> tuple[Any, Any, Any]:
+        optics, grid = self._optics.with_values(values), self._grid
+        reference = Reference.of(grid, optics.channel_count, reference)
+        suns = len(grid.first_theta) if n == 2 else grid.shape[1]
+        gather = self._gather(optics, reference, n, gather)
+        light = self._next(gather, Moments(light, self._degree(n - 1), suns, optics.channel_count), n)
+        return light.values, _probe(light, grid, reference), gather.held
+
+    def _gather(self, optics: Optics, reference: Reference, n: int, held: Any) -> Gather:
+        stage, r = self._stage(n), self._resolution
+        s = r.stages[stage]
+        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.degree, r.nodes, held)
+
+    def _next(self, gather: Gather, light: Moments, n: int) -> Moments:
+        project = Projection.at(self._grid, self._stages[self._stage(n)], self._degree(n))
+        return project(gather(light), self._grid.shape[1], light.channels)
+
+    def _finish(self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
+        optics, grid = self._optics.with_values(values), self._grid
+        channels = optics.channel_count
+        reference = Reference.of(grid, channels, reference)
+        first = Moments(first, self._degree(1), len(grid.first_theta), channels)
+        rest = [Moments(v, self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
+        return total_of(optics, self._columns, grid, reference, first, rest, shares)
+
+
+def _differentiable(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(_differentiable(v) for v in value.values())
+    if isinstance(value, (list, tuple)):
+        return any(_differentiable(v) for v in value)
+    return dr.is_array_v(value) and dr.grad_enabled(value)
+
+
+def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:
     """The moments of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
     t, (altitudes, suns), channels = types(), grid.shape, order.channels
     lane = dr.arange(t.UInt, altitudes * suns * 2 * channels)
@@ -77,7 +196,8 @@ def _probe(order: Moments, grid: Grid, reference: Reference) -> np.ndarray:
     sun, k = node % suns, node // suns
     values = dr.gather(t.Float, dr.detach(order.values), order.index(k, entry, sun, channel))
     values = values * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    return values.numpy().reshape(altitudes, suns, 2, channels)
+    dr.eval(values)
+    return values
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:

@@ -102,6 +102,7 @@ class PathWeights:
             ]
 
         sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
+        self.scattered = dr.zeros(t.Float, 8)
         if sums:
             _, sums = dr.while_loop((bounds[0] + 0, sums), lambda i, _: i < bounds[-1], add, max_iterations=-1, label="weights")
             self.scattered = table_of([s * device.factor for s in sums], visit)

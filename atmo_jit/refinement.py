@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from .backend import packet, stored, types
 from .grid import Grid, cubic
@@ -22,12 +21,32 @@ class Reference:
     """``log`` [K, first suns, channels] of the reference, ``inverse`` = exp(-log), and ``fine`` [K, sources, 4]: its
     logarithm at refined suns. It guides only: it carries no derivative.
 
-    ``light``: order 1.
     """
 
-    def __init__(self, grid: Grid, light: Moments) -> None:
-        t, channels = types(), light.channels
+    def __init__(self, grid: Grid, channels: int) -> None:
         self.grid, self.channels = grid, channels
+
+    @classmethod
+    def of(cls, grid: Grid, channels: int, held: dict[str, Any]) -> Reference:
+        """The reference that ``held`` came from."""
+        reference = cls(grid, channels)
+        vars(reference).update(held)
+        return reference
+
+    @property
+    def held(self) -> dict[str, Any]:
+        """Its arrays."""
+        return {"log": self.log, "inverse": self.inverse, "fine": self.fine}
+
+    @classmethod
+    def above(cls, grid: Grid, light: Moments) -> Reference:
+        """The reference for order 1."""
+        reference = cls(grid, light.channels)
+        reference._make(light)
+        return reference
+
+    def _make(self, light: Moments) -> None:
+        t, grid, channels = types(), self.grid, light.channels
         altitudes, suns = grid.shape[0], len(grid.first_theta)
         lane = dr.arange(t.UInt, altitudes * suns * channels)
         channel, node = lane % channels, lane // channels
@@ -90,8 +109,3 @@ class Taps:
         for weight, value in zip(self.weights[1:], values[1:], strict=True):
             total = dr.fma(weight, value, total)
         return total
-
-
-def parity(m: np.ndarray) -> np.ndarray:
-    """(-1)^m."""
-    return 1.0 - 2.0 * (np.asarray(m) % 2)

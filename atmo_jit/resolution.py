@@ -37,7 +37,7 @@ class Resolution:
     solved, the last serves all that follow; ``nodes``: Gauss points per piece of their paths. ``first_*``: the same
     for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there; ``beam_*``:
     altitude levels per interval, azimuths and Gauss points at which sunlight is followed, phase functions apart.
-    ``orders``: most orders solved. ``columns``: size of the sun-column table (altitudes, cosines).
+    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
@@ -55,7 +55,13 @@ class Resolution:
     beam_azimuths: int = 5
     beam_nodes: int = 3
     orders: int = 40
+    converged: float = 0.1
     columns: tuple[int, int] = (128, 96)
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """Degrees of phase moments that a solve asks for: one more than those of the moments of light."""
+        return tuple(sorted({self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
 
     @classmethod
     def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
