@@ -16,7 +16,7 @@ import numpy as np
 
 from .backend import floats, packet, padded, row, row_size, stored, table_of, types, uints
 from .column import SunColumns
-from .grid import Grid
+from .grid import Grid, split
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
 from .projection import Moments
@@ -87,6 +87,18 @@ class Field:
     def _irradiances(self) -> tuple[Any, Any]:
         return self._refined(self.sky, 1), self._refined(self.reflected, 1)
 
+    def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
+        """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
+        [2][channel]."""
+        suns = self.grid.sources
+        k, fk = self.grid.locate_altitude(h)
+        x = self.grid.sun_position(mu_s)
+        s, fs = split(x * float(self.grid.sun_refine), suns)
+        first = k * suns + s
+        nodes = [first, first + 1, first + suns, first + suns + 1]
+        weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
+        return nodes, weights, [self.reference.at(level, x, active) for level in (k, k + 1)]
+
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
 
@@ -97,18 +109,15 @@ class Field:
             return [0.0 * h for _ in channels]
         suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
-        s, fs = self.grid.locate_sun(mu_s)
+        x = self.grid.sun_position(mu_s)
+        s, fs = split(x * float(self.grid.sun_refine), suns)
         buffer = self._irradiances[int(reflected)]
         logs = []
-        for node in (k * suns + s, (k + 1) * suns + s):
-            guide = [packet(self.reference.fine, node + i, 4, active) for i in (0, 1)]
-            values = [packet(buffer, node + i, size, active) for i in (0, 1)]
+        for level in (k, k + 1):
+            guide = self.reference.at(level, x, active)
+            values = [packet(buffer, level * suns + s + i, size, active) for i in (0, 1)]
             logs.append(
-                [
-                    dr.lerp(guide[0][c], guide[1][c], fs)
-                    + dr.log(dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30))
-                    for c in channels
-                ]
+                [dr.log(guide[c] * dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30)) for c in channels]
             )
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
         above = self.optics.scattering_depths(self.columns.upward(h))

@@ -171,7 +171,7 @@ class Grid:
         position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return _split(dr.lerp(u0, u1, position - t.Float(cell)), self.shape[0])
+        return split(dr.lerp(u0, u1, position - t.Float(cell)), self.shape[0])
 
     @cached_property
     def _sun_map(self) -> list[Any]:
@@ -186,7 +186,7 @@ class Grid:
 
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
         """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
-        return _split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
+        return split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
 
 
 def _collect(value: Any, found: dict[int, Any], seen: set[int]) -> None:
@@ -219,7 +219,8 @@ def _profile_key(profile: Any) -> Any:
     return profile
 
 
-def _split(position: Any, count: int) -> tuple[Any, Any]:
+def split(position: Any, count: int) -> tuple[Any, Any]:
+    """Index of the node before a position, and the fraction of the way to the next."""
     t = types()
     index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), dr.opaque(t.UInt, count - 2, 1))
     return index, position - t.Float(index)

@@ -104,7 +104,8 @@ class PathWeights:
         sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
         self.scattered = dr.zeros(t.Float, 8)
         if sums:
-            _, sums = dr.while_loop((bounds[0] + 0, sums), lambda i, _: i < bounds[-1], add, max_iterations=-1, label="weights")
+            state, end = (bounds[0] + 0, sums), bounds[-1]
+            _, sums = dr.while_loop(state, lambda i, _: i < end, add, max_iterations=-1, label="weights")
             self.scattered = table_of([s * device.factor for s in sums], visit)
         depths = [0.0] * channels
         if kinds:

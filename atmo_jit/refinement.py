@@ -14,12 +14,13 @@ from .backend import packet, stored, types
 from .grid import Grid, cubic
 from .projection import Moments
 
+FINE = 16  # parts of an interval of solved suns; 1.2 e-folds over it are then linear to 0.1 %
 STEEPEST = 1.2  # e-folds of the reference from one solved sun to the next
 
 
 class Reference:
-    """``log`` [K, first suns, channels] of the reference, ``inverse`` = exp(-log), and ``fine`` [K, sources, 4]: its
-    logarithm at refined suns. It guides only: it carries no derivative.
+    """``log`` [K, first suns, channels] of the reference, ``inverse`` = exp(-log), and ``fine`` [K, suns, 4]: the
+    reference at so many suns that it is linear between them. It guides only: it carries no derivative.
 
     """
 
@@ -65,11 +66,12 @@ class Reference:
         _, self.log = dr.while_loop((t.UInt(0), logs), lambda i, _: i < end, steady, label="steady")
         self.inverse = dr.exp(-self.log)
         dr.eval(self.log, self.inverse)
-        lane = dr.arange(t.UInt, altitudes * grid.sources)
-        source, k = lane % grid.sources, lane // grid.sources
-        taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
+        fine = FINE * (grid.shape[1] - 1) + 1
+        lane = dr.arange(t.UInt, altitudes * fine)
+        source, k = lane % fine, lane // fine
+        taps = Taps(grid, t.Float(source) * (grid.first / FINE), suns)
         values = [
-            taps.sum([dr.gather(t.Float, self.log, (k * suns + at) * channels + c) for at in taps.at])
+            dr.exp(taps.sum([dr.gather(t.Float, self.log, (k * suns + at) * channels + c) for at in taps.at]))
             for c in range(channels)
         ]
         self.fine = stored(values, lane, 4)
@@ -78,14 +80,14 @@ class Reference:
         """Place of ``inverse`` at an altitude node and a solved sun."""
         return (k * len(self.grid.first_theta) + sun * self.grid.first) * self.channels + channel
 
-    def at(self, level: Any, x: Any) -> list[Any]:
+    def at(self, level: Any, x: Any, active: Any = True) -> list[Any]:
         """The reference at a level and a sun coordinate, per channel."""
-        t, sources = types(), self.grid.sources
-        x = x * float(self.grid.sun_refine)
-        s = dr.minimum(t.UInt(x), sources - 2)
+        t, fine = types(), FINE * (self.grid.shape[1] - 1) + 1
+        x = x * float(FINE)
+        s = dr.minimum(t.UInt(x), fine - 2)
         f = x - t.Float(s)
-        low, high = (packet(self.fine, level * sources + s + i, 4) for i in (0, 1))
-        return [dr.exp(dr.fma(f, high[c] - low[c], low[c])) for c in range(self.channels)]
+        low, high = (packet(self.fine, level * fine + s + i, 4, active) for i in (0, 1))
+        return [dr.fma(f, high[c] - low[c], low[c]) for c in range(self.channels)]
 
 
 class Taps:
