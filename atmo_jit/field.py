@@ -17,7 +17,7 @@ import numpy as np
 from .backend import floats, packet, padded, row, row_size, stored, table_of, types, uints
 from .column import SunColumns
 from .grid import Grid, split
-from .harmonics import pair_count, pairs, recurrence
+from .harmonics import pair_count, pair_index, pairs, recurrence
 from .optics import Optics
 from .projection import Moments
 from .refinement import Reference, Taps
@@ -197,15 +197,25 @@ def total_of(
     counted, arriving = ([pair[i] for pair in shares] for i in (0, 1))
     entries = pair_count(first.degree)
     per_depth = _per_depth(optics, columns, grid)
+    peaks = [
+        _peak(optics, grid, first, order, n) if order.degree < first.degree else None for n, order in enumerate(rest, 1)
+    ]
     return (
-        _sum(grid, reference, first, rest, counted, 0, entries),
+        _sum(grid, reference, first, rest, counted, 0, entries, peaks),
         _over(grid, _sum(grid, reference, first, rest, arriving, entries, 1), per_depth, first.channels),
         _over(grid, _sum(grid, reference, first, rest, counted, entries, 1), per_depth, first.channels),
     )
 
 
 def _sum(
-    grid: Grid, reference: Reference, first: Moments, rest: list[Moments], shares: list[Any], start: int, entries: int
+    grid: Grid,
+    reference: Reference,
+    first: Moments,
+    rest: list[Moments],
+    shares: list[Any],
+    start: int,
+    entries: int,
+    peaks: list[Any] | None = None,
 ) -> Any:
     """Quotients [K, first suns, entries, channels] over the reference of the weighed sum of orders, from entry
     ``start`` of order 1 on."""
@@ -218,18 +228,23 @@ def _sum(
     total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
     total = total * dr.gather(t.Float, reference.inverse, node * channels + channel)
     if rest:
-        later = _rest(grid, reference, first.degree, rest, shares, start, entries)
+        later = _rest(grid, reference, first, rest, shares, start, entries, peaks)
         taps = Taps(grid, t.Float(sun) / grid.first, few)
-        values = [
-            dr.gather(t.Float, later, ((k * few + at) * entries + entry) * channels + channel) for at in taps.at
-        ]
+        values = [dr.gather(t.Float, later, ((k * few + at) * entries + entry) * channels + channel) for at in taps.at]
         total = total + taps.sum(values, dr.gather(t.Float, _parity(grid, first.degree), start + entry))
     dr.eval(total)
     return total
 
 
 def _rest(
-    grid: Grid, reference: Reference, degree: int, rest: list[Moments], shares: list[Any], start: int, entries: int
+    grid: Grid,
+    reference: Reference,
+    first: Moments,
+    rest: list[Moments],
+    shares: list[Any],
+    start: int,
+    entries: int,
+    peaks: list[Any] | None,
 ) -> Any:
     """The same of the later orders, at their suns [K, S, entries, channels]."""
     t, channels, suns = types(), rest[0].channels, grid.shape[1]
@@ -238,15 +253,66 @@ def _rest(
     entry, node = place % entries, place // entries
     sun, k = node % suns, node // suns
     total = 0.0
-    for order, share in zip(rest, shares, strict=True):
-        there = dr.gather(t.UInt, _places(grid, degree, order.degree), start + entry)
+    sharp = None
+    if peaks and any(peak is not None for peak in peaks):
+        sharp = dr.gather(t.Float, first.values, first.index(k, entry, sun * grid.first, channel))
+    for order, share, peak in zip(rest, shares, peaks or [None] * len(rest), strict=True):
+        there = dr.gather(t.UInt, _places(grid, first.degree, order.degree), start + entry)
         held = there > 0
         index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
         weight = dr.gather(t.Float, share, sun * channels + channel)
-        total = dr.fma(dr.gather(t.Float, order.values, index, held), weight, total)
+        value = dr.gather(t.Float, order.values, index, held)
+        if peak is not None:
+            size, fading = peak
+            more = dr.gather(t.Float, size, (k * suns + sun) * channels + channel)
+            value = dr.select(held, value, sharp * more * dr.gather(t.Float, fading, entry * channels + channel))
+        total = dr.fma(value, weight, total)
     total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
     dr.eval(total)
     return total
+
+
+def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: int) -> tuple[Any, Any]:
+    """Forward peak of an order beyond its degree L, as a part of order 1: (size [K, S, channels], fading [entries,
+    channels]).
+
+    Light in a forward peak goes nearly straight on, and every further event multiplies its moments of degree l by one
+    factor that does not depend on l, and by chi_l. So with n ``events`` more than order 1 has,
+
+        L_lm = L_lm(order 1) r (chi_l / chi_L)^n    for l > L,
+
+    where r is how order and order 1 compare at degree L.
+    """
+    t, channels, kinds, suns = types(), first.channels, len(optics.scatterers), grid.shape[1]
+    lane = dr.arange(t.UInt, grid.shape[0] * suns * channels)
+    channel, node = lane % channels, lane // channels
+    sun, k = node % suns, node // suns
+    product, square, degree = 0.0, 0.0, order.degree
+    for m in range(degree + 1):
+        a = dr.gather(
+            t.Float, first.values, first.index(k, pair_index(first.degree, degree, m), sun * grid.first, channel)
+        )
+        b = dr.gather(t.Float, order.values, order.index(k, pair_index(degree, degree, m), sun, channel))
+        product, square = dr.fma(a, b, product), dr.fma(a, a, square)
+    size = dr.select(square > 0.0, dr.maximum(product, 0.0) / dr.select(square > 0.0, square, 1.0), 0.0)
+    lane = dr.arange(t.UInt, pair_count(first.degree))
+    l_ = dr.gather(t.UInt, grid.kept(("degrees", first.degree), lambda: uints(pairs(first.degree)[0])), lane)
+    moments = optics.phase_moments(first.degree + 1)
+    there, last = (row(moments, at, kinds * channels) for at in (l_, dr.full(t.UInt, degree, dr.width(l_))))
+    values = []
+    for c in range(channels):
+        # Beyond degree 2 only aerosols scatter; of several, the sharpest keeps its peak longest.
+        high, low = there[c], last[c]
+        for n in range(1, kinds):
+            high, low = dr.maximum(high, there[n * channels + c]), dr.maximum(low, last[n * channels + c])
+        quotient = dr.select(low > 0.0, dr.clip(high / dr.select(low > 0.0, low, 1.0), 0.0, 1.0), 0.0)
+        power = quotient
+        for _ in range(events - 1):
+            power = power * quotient
+        values.append(power)
+    fading = dr.ravel(t.ArrayXf(values), order="F")
+    dr.eval(size, fading)
+    return size, fading
 
 
 def _places(grid: Grid, degree: int, lower: int) -> Any:
