@@ -198,7 +198,8 @@ def total_of(
     entries = pair_count(first.degree)
     per_depth = _per_depth(optics, columns, grid)
     peaks = [
-        _peak(optics, grid, first, order, n) if order.degree < first.degree else None for n, order in enumerate(rest, 1)
+        _peak(optics, grid, first, order, n) if order.entries < first.entries else None
+        for n, order in enumerate(rest, 1)
     ]
     return (
         _sum(grid, reference, first, rest, counted, 0, entries, peaks),
@@ -257,14 +258,15 @@ def _rest(
     if peaks and any(peak is not None for peak in peaks):
         sharp = dr.gather(t.Float, first.values, first.index(k, entry, sun * grid.first, channel))
     for order, share, peak in zip(rest, shares, peaks or [None] * len(rest), strict=True):
-        there = dr.gather(t.UInt, _places(grid, first.degree, order.degree), start + entry)
+        there = dr.gather(t.UInt, _places(grid, first, order), start + entry)
         held = there > 0
         index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
         weight = dr.gather(t.Float, share, sun * channels + channel)
         value = dr.gather(t.Float, order.values, index, held)
         if peak is not None:
             size, fading = peak
-            more = dr.gather(t.Float, size, (k * suns + sun) * channels + channel)
+            l_ = dr.minimum(dr.gather(t.UInt, _degrees(grid, first.degree), entry), order.degree)
+            more = dr.gather(t.Float, size, ((l_ * grid.shape[0] + k) * suns + sun) * channels + channel)
             value = dr.select(held, value, sharp * more * dr.gather(t.Float, fading, entry * channels + channel))
         total = dr.fma(value, weight, total)
     total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
@@ -273,32 +275,37 @@ def _rest(
 
 
 def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: int) -> tuple[Any, Any]:
-    """Forward peak of an order beyond its degree L, as a part of order 1: (size [K, S, channels], fading [entries,
-    channels]).
+    """Forward peak of an order beyond the moments that it has, as a part of order 1: (size [l, K, S, channels], fading
+    [entries, channels]).
 
     Light in a forward peak goes nearly straight on, and every further event multiplies its moments of degree l by one
-    factor that does not depend on l, and by chi_l. So with n ``events`` more than order 1 has,
+    factor that does not depend on l, and by chi_l. So with n ``events`` more than order 1 has, and known moments up to
+    degree L and azimuthal order M,
 
-        L_lm = L_lm(order 1) r (chi_l / chi_L)^n    for l > L,
+        L_lm = L_lm(order 1) r_l                          for l <= L, m > M,
+        L_lm = L_lm(order 1) r_L (chi_l / chi_L)^n        for l > L,
 
-    where r is how order and order 1 compare at degree L.
+    where r_l is how order and order 1 compare at degree l, m >= 1: m = 0 has the horizon in it.
     """
-    t, channels, kinds, suns = types(), first.channels, len(optics.scatterers), grid.shape[1]
-    lane = dr.arange(t.UInt, grid.shape[0] * suns * channels)
+    t, channels, kinds, (altitudes, suns) = types(), first.channels, len(optics.scatterers), grid.shape
+    lane = dr.arange(t.UInt, (order.degree + 1) * altitudes * suns * channels)
     channel, node = lane % channels, lane // channels
-    sun, k = node % suns, node // suns
-    product, square, degree = 0.0, 0.0, order.degree
-    for m in range(degree + 1):
-        a = dr.gather(
-            t.Float, first.values, first.index(k, pair_index(first.degree, degree, m), sun * grid.first, channel)
+    sun, node = node % suns, node // suns
+    k, l_ = node % altitudes, node // altitudes
+    product, square = 0.0, 0.0
+    for m in range(min(order.most, 1), order.most + 1):
+        held = l_ >= m
+        # Places of (l, m) are consecutive in l.
+        a, b = (
+            dr.gather(t.Float, light.values, light.index(k, l_ - m + pair_index(light.degree, m, m), there, channel), held)
+            for light, there in ((first, sun * grid.first), (order, sun))
         )
-        b = dr.gather(t.Float, order.values, order.index(k, pair_index(degree, degree, m), sun, channel))
         product, square = dr.fma(a, b, product), dr.fma(a, a, square)
     size = dr.select(square > 0.0, dr.maximum(product, 0.0) / dr.select(square > 0.0, square, 1.0), 0.0)
-    lane = dr.arange(t.UInt, pair_count(first.degree))
-    l_ = dr.gather(t.UInt, grid.kept(("degrees", first.degree), lambda: uints(pairs(first.degree)[0])), lane)
+
+    l_ = _degrees(grid, first.degree)
     moments = optics.phase_moments(first.degree + 1)
-    there, last = (row(moments, at, kinds * channels) for at in (l_, dr.full(t.UInt, degree, dr.width(l_))))
+    there, last = (row(moments, at, kinds * channels) for at in (l_, dr.minimum(l_, order.degree)))
     values = []
     for c in range(channels):
         # Beyond degree 2 only aerosols scatter; of several, the sharpest keeps its peak longest.
@@ -315,15 +322,23 @@ def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: in
     return size, fading
 
 
-def _places(grid: Grid, degree: int, lower: int) -> Any:
-    """Place + 1 among the entries of a ``lower`` degree for every entry of ``degree``; 0: it is not there."""
+def _degrees(grid: Grid, degree: int) -> Any:
+    """l of every pair."""
+    return grid.kept(("degrees", degree), lambda: uints(pairs(degree)[0]))
+
+
+def _places(grid: Grid, light: Moments, lower: Moments) -> Any:
+    """Place + 1 among the entries of ``lower`` for every entry of ``light``; 0: it is not there."""
 
     def find() -> Any:
-        stored_pairs = [list(zip(*(a.tolist() for a in pairs(d)), strict=True)) for d in (degree, lower)]
+        stored_pairs = [
+            list(zip(*(a[: moments.entries - 1].tolist() for a in pairs(moments.degree)), strict=True))
+            for moments in (light, lower)
+        ]
         place = {pair: i + 1 for i, pair in enumerate(stored_pairs[1])}
         return uints([*(place.get(pair, 0) for pair in stored_pairs[0]), len(place) + 1])
 
-    return grid.kept(("places", degree, lower), find)
+    return grid.kept(("places", light.degree, lower.degree, lower.most), find)
 
 
 def _parity(grid: Grid, degree: int) -> Any:

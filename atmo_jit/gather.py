@@ -58,7 +58,7 @@ class Samples:
 
 class Gather:
     """The step from one order to the next for one atmosphere, along ``directions`` seen at ``azimuths``; the light that
-    it returns is of degree ``degree``. ``held``: what another of the same kind made of the atmosphere."""
+    it returns has azimuthal orders up to ``most``. ``held``: what another of the same kind made of the atmosphere."""
 
     def __init__(
         self,
@@ -67,12 +67,12 @@ class Gather:
         reference: Reference,
         directions: Directions,
         azimuths: int,
-        degree: int,
+        most: int,
         nodes: int,
         held: dict[str, Any] | None = None,
     ) -> None:
         self.optics, self.grid, self.reference = optics, grid, reference
-        self.azimuths, self.degree = azimuths, degree
+        self.azimuths, self.most = azimuths, most
         key = ("samples", directions, azimuths)
         self.samples = grid.kept(key, lambda: Samples(grid, directions, azimuths))
         self.paths = self.samples.paths
@@ -94,7 +94,7 @@ class Gather:
     def __call__(self, light: Moments) -> Any:
         """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
         t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
-        orders = min(light.degree, self.degree) + 1
+        orders = min(light.most, self.most) + 1
         table, device, per_visit = self._contract(light, orders), self.paths.device, suns * azimuths
         lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
@@ -136,7 +136,7 @@ class Gather:
             values = packet(radiance, node * azimuths + j, 4)[:channels]
             return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j))
 
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.degree + 1) * channels)]
+        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 1) * channels)]
         end = dr.opaque(t.UInt, azimuths, 1)
         _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="azimuths")
         return stored_harmonics(sums, azimuths)
@@ -222,7 +222,7 @@ class Gather:
             sun[0], sun[-1] = int(grid.whole_suns), suns - 1
             return uints(place + 1), floats(sign), uints(sun)
 
-        place, sign, which = grid.kept(("rows", degree, orders, channels), places)
+        place, sign, which = grid.kept(("rows", degree, light.most, orders, channels), places)
         lane = dr.arange(t.UInt, altitudes * (suns + 2) * rows * width)
         entry, node = lane % (rows * width), lane // (rows * width)
         sun, k = node % (suns + 2), node // (suns + 2)

@@ -133,13 +133,15 @@ class _Steps:
     def _stage(self, n: int) -> int:
         return min(n - 2, len(self._stages) - 1)
 
-    def _degree(self, n: int) -> int:
-        return self._resolution.first_degree if n == 1 else self._resolution.stages[self._stage(n)].degree
+    def _degree(self, n: int) -> tuple[int, int]:
+        """Highest l and m of an order."""
+        r = self._resolution
+        return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
 
     def _start(self, values: Any, count: int) -> dict[str, Any]:
         optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
         suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
-        project = Projection.at(grid, fine, r.first_degree)
+        project = Projection.at(grid, fine, *self._degree(1))
         first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
         reference = Reference.above(grid, first)
         later, probes, light, gather = [], [], first, None
@@ -158,24 +160,24 @@ class _Steps:
         reference = Reference.of(grid, optics.channel_count, reference)
         suns = len(grid.first_theta) if n == 2 else grid.shape[1]
         gather = self._gather(optics, reference, n, gather)
-        light = self._next(gather, Moments(light, self._degree(n - 1), suns, optics.channel_count), n)
+        light = self._next(gather, Moments(light, *self._degree(n - 1), suns, optics.channel_count), n)
         return light.values, _probe(light, grid, reference), gather.held
 
     def _gather(self, optics: Optics, reference: Reference, n: int, held: Any) -> Gather:
         stage, r = self._stage(n), self._resolution
         s = r.stages[stage]
-        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.degree, r.nodes, held)
+        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.most, r.nodes, held)
 
     def _next(self, gather: Gather, light: Moments, n: int) -> Moments:
-        project = Projection.at(self._grid, self._stages[self._stage(n)], self._degree(n))
+        project = Projection.at(self._grid, self._stages[self._stage(n)], *self._degree(n))
         return project(gather(light), self._grid.shape[1], light.channels)
 
     def _finish(self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
         optics, grid = self._optics.with_values(values), self._grid
         channels = optics.channel_count
         reference = Reference.of(grid, channels, reference)
-        first = Moments(first, self._degree(1), len(grid.first_theta), channels)
-        rest = [Moments(v, self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
+        first = Moments(first, *self._degree(1), len(grid.first_theta), channels)
+        rest = [Moments(v, *self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
         return total_of(optics, self._columns, grid, reference, first, rest, shares)
 
 

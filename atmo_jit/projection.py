@@ -44,20 +44,22 @@ def room(suns: int) -> int:
 
 @dataclass
 class Moments:
-    """Moments and irradiance of one order at the nodes: ``values`` [K, pairs(degree) + 1, room(suns), channels].
+    """Moments and irradiance of one order at the nodes: ``values`` [K, pairs + 1, room(suns), channels].
 
-    The irradiance of a horizontal surface facing up comes after the last pair. ``suns``: how many there are.
+    Moments are of degrees up to ``degree`` and azimuthal orders up to ``most``. The irradiance of a horizontal surface
+    facing up comes after the last pair. ``suns``: how many there are.
     """
 
     values: Any
     degree: int
+    most: int
     suns: int
     channels: int
 
     @property
     def entries(self) -> int:
         """Pairs and the irradiance."""
-        return pair_count(self.degree) + 1
+        return pair_count(self.degree, self.most) + 1
 
     def index(self, k: Any, entry: Any, sun: Any, channel: Any) -> Any:
         """Place of a value."""
@@ -70,21 +72,22 @@ class Projection:
     Weights of the directions for every pair (l, m), and after them those of the irradiance.
     """
 
-    def __init__(self, grid: Grid, directions: Directions, degree: int) -> None:
-        self.degree = degree
+    def __init__(self, directions: Directions, degree: int, most: int) -> None:
+        self.degree, self.most = degree, most
         self.altitudes, self.count = directions.mu.shape
-        l_, m = pairs(degree)
-        basis = legendre(degree, directions.mu) * directions.weight[..., None]  # [K, D, pairs]
+        count = pair_count(degree, most)
+        m = pairs(degree)[1][:count]
+        basis = legendre(degree, directions.mu)[..., :count] * directions.weight[..., None]  # [K, D, pairs]
         basis = np.concatenate([basis, directions.facing_up[..., None]], axis=-1)
         # One row per altitude and pair, directions within.
         self._basis = floats(np.swapaxes(basis, 1, 2))
         self._m = uints(np.append(m, 0))
-        self.entries = len(l_) + 1
+        self.entries = count + 1
 
     @classmethod
-    def at(cls, grid: Grid, directions: Directions, degree: int) -> Projection:
+    def at(cls, grid: Grid, directions: Directions, degree: int, most: int) -> Projection:
         """The projection for a grid, kept with it."""
-        return grid.kept(("projection", directions, degree), lambda: cls(grid, directions, degree))
+        return grid.kept(("projection", directions, degree, most), lambda: cls(directions, degree, most))
 
     def __call__(self, harmonics: Any, suns: int, channels: int) -> Moments:
         """``harmonics`` [m, channel, K, D, room(suns)] -> moments and irradiance."""
@@ -105,4 +108,4 @@ class Projection:
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(TOGETHER * channels)]
         end = dr.opaque(t.UInt, count, 1)
         _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, max_iterations=-1, label="directions")
-        return Moments(stored(sums, lane, len(sums)), self.degree, suns, channels)
+        return Moments(stored(sums, lane, len(sums)), self.degree, self.most, suns, channels)

@@ -19,10 +19,11 @@ DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shar
 
 @dataclass(frozen=True)
 class Stage:
-    """Directions and azimuths (of the half circle) at a node for an order of scattering, and the ``degree`` of the
-    moments that result."""
+    """Directions and azimuths (of the half circle) at a node for an order of scattering, and the moments that result:
+    degrees up to ``degree``, azimuthal orders up to ``most``."""
 
     degree: int
+    most: int
     up: int
     down: int
     azimuths: int
@@ -44,7 +45,7 @@ class Resolution:
     suns: int = 25
     sun_refine: int = 4
     first_suns: int = 2
-    stages: tuple[Stage, ...] = (Stage(4, 6, 4, 6),)
+    stages: tuple[Stage, ...] = (Stage(4, 4, 6, 4, 6),)
     nodes: int = 3
     first_up: int = 10
     first_down: int = 8
@@ -78,7 +79,7 @@ class Resolution:
         return cls(
             altitudes=_altitudes(atmosphere, 16 if fine else 12),
             stages=(
-                Stage(later, later + (4 if later > 6 else 2), max(4, (4 * later) // 5 + 2), max(later, first // 2) + 1),
+                Stage(later, later, later + (4 if later > 6 else 2), max(4, (4 * later) // 5 + 2), max(later, first // 2) + 1),
             ),
             first_up=max(10, first + 2 if first > 12 else first),
             first_down=max(8, first if first > 12 else first - 2),
