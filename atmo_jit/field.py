@@ -50,7 +50,7 @@ class Field:
         self._size = padded(optics.channel_count)
 
     def _refined(self, values: Any, entries: int) -> Any:
-        """[K, first suns, entries, channels] -> [K, sources, entries, size], interpolated cubically."""
+        """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically."""
         t, grid, channels = types(), self.grid, self.optics.channel_count
         suns = len(grid.first_theta)
         lane = dr.arange(t.UInt, grid.shape[0] * grid.sources * entries)

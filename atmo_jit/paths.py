@@ -48,7 +48,7 @@ class Paths:
     ``mu`` (zenith cosine there), ``cos_turn``, ``sin_turn`` (angle about the centre), ``u`` (altitude coordinate in
     levels). Per ray: ``h``, ``mu_start``; ``ground``: it ends on it.
 
-    Light is looked up at visits: one per station on a level, two (the levels below and above) at another, a perigee.
+    Light is looked up at visits: one per station on a level, four (two levels below, two above) at another, a perigee.
     Per visit: its ``station``, ``level``, and ``factor``, the share of that level. ``first_visit`` [N + 1]: where each
     ray's visits start. Where stations off the levels have levels ``of_their_own``, there is one visit per station.
 
@@ -58,7 +58,6 @@ class Paths:
     grid: Grid
     refine: int
     levels: np.ndarray
-    of_their_own: bool
     first: np.ndarray
     ray: np.ndarray
     distance: np.ndarray
@@ -145,15 +144,15 @@ class Paths:
             level = np.where(apart, count + np.cumsum(apart) - 1, below + (share == 1.0))
             levels = np.concatenate([levels, np.where(at_perigee, perigee[:, None], h[:, None])[ray, column][apart]])
         else:
-            station = np.repeat(np.arange(len(u)), 1 + apart)
-            upper = np.append(False, station[1:] == station[:-1]) | (share == 1.0)[station]
-            level, factor = below[station] + upper, np.where(upper, share[station], 1.0 - share[station])
+            around = np.clip(below - 1, 0, max(count - 4, 0))[:, None] + np.arange(min(count, 4))
+            shares = _lagrange(around.astype(float), u)
+            station, place = np.nonzero(np.where(apart[:, None], np.abs(shares) > 0.0, around == np.round(u)[:, None]))
+            level, factor = around[station, place], np.where(apart[station], shares[station, place], 1.0)
         first = np.concatenate([[0], np.cumsum(reached.sum(axis=1))])
         return cls(
             grid=grid,
             refine=refine,
             levels=levels,
-            of_their_own=of_their_own,
             first=first,
             ray=ray,
             distance=d,
@@ -191,7 +190,7 @@ class Paths:
         at = start[:, None] + part_length[piece][:, None] * x
         h = self._altitude(np.repeat(ray[piece], nodes), at.ravel())
         behind = np.repeat(follows[piece], nodes)
-        shares = self._cubic_shares(behind, at.ravel()) if self.of_their_own else self._linear_shares(behind, h)
+        shares = self._shares(behind, at.ravel())
         per_station = np.zeros(self.count, dtype=int)
         per_station[follows] = parts
         first_part = np.concatenate([[0], np.cumsum(per_station)])
@@ -206,27 +205,13 @@ class Paths:
             part_ray=ray[piece],
         )
 
-    def _linear_shares(self, behind: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Hat functions in the altitude coordinate: what is solved at the levels is linear in it."""
-        u0, u1, u = self.u[behind], self.u[behind + 1], self.refine * self.grid.u_of(h)
-        same = u0 == u1
-        ahead = np.where(same, 0.5, np.clip((u - u0) / np.where(same, 1.0, u1 - u0), 0.0, 1.0))
-        return np.column_stack([1.0 - ahead, ahead])
-
-    def _cubic_shares(self, behind: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    def _shares(self, behind: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """Lagrange polynomials in the distance through two stations behind and two ahead, or as many as there are:
-        sunlight is known at the stations alone."""
+        light is known at the stations alone."""
         at = behind[:, None] + np.arange(-1, 3)
         there = np.clip(at, 0, self.count - 1)
         held = (there == at) & (self.ray[there] == self.ray[behind][:, None])
-        x = np.where(held, self.distance[there], 0.0)
-        shares = np.where(held, 1.0, 0.0)
-        for i in range(4):
-            for j in range(4):
-                if i != j:
-                    gap = np.where(held[:, i] & held[:, j], x[:, i] - x[:, j], 1.0)
-                    shares[:, i] *= np.where(held[:, i] & held[:, j], (distance - x[:, j]) / gap, 1.0)
-        return shares
+        return _lagrange(np.where(held, self.distance[there], np.nan), distance)
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
         radius = self.grid.radius_m
@@ -240,8 +225,8 @@ class Paths:
 class Points:
     """Gauss points along paths, in sets of ``nodes``: one set for every part of a piece.
 
-    Per point: altitude ``h`` (m), ``length`` of its part and ``weight`` (m), and the ``shares`` [points, 2 or 4] that
-    stations have in what happens there: the ones behind and ahead, or two of each. ``first_part`` [T + 1]: where the
+    Per point: altitude ``h`` (m), ``length`` of its part and ``weight`` (m), and the ``shares`` [points, 4] that stations have
+    in what happens there, two behind and two ahead. ``first_part`` [T + 1]: where the
     parts of the piece after each station start; ``part_ray``.
     """
 
@@ -273,6 +258,18 @@ class Points:
             ray_parts=uints(np.column_stack([per_ray[:-1], per_ray[1:]])),
             running=table(running_integral(self.nodes, tuple(gauss_legendre(self.nodes)[0].tolist()))),
         )
+
+
+def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Weights [N, n] of values at ``nodes`` [N, n] (NaN: there is none) in the polynomial through them at ``at`` [N]."""
+    held = np.isfinite(nodes)
+    weights = np.where(held, 1.0, 0.0)
+    for i in range(nodes.shape[1]):
+        for j in range(nodes.shape[1]):
+            both = (i != j) & held[:, i] & held[:, j]
+            gap = np.where(both, nodes[:, i] - nodes[:, j], 1.0)
+            weights[:, i] *= np.where(both, (at - np.where(both, nodes[:, j], 0.0)) / gap, 1.0)
+    return weights
 
 
 def directions_at(grid: Grid, up: int, down: int) -> Directions:
