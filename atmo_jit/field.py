@@ -19,6 +19,7 @@ from .column import SunColumns
 from .grid import Grid, split
 from .harmonics import pair_count, pair_index, pairs, recurrence
 from .optics import Optics
+from .paths import lagrange
 from .projection import Moments
 from .refinement import Reference, Taps
 
@@ -53,12 +54,14 @@ class Field:
         """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically."""
         t, grid, channels = types(), self.grid, self.optics.channel_count
         suns = len(grid.first_theta)
-        lane = dr.arange(t.UInt, grid.shape[0] * grid.sources * entries)
+        row_length = suns * entries * channels
+        values = _between_levels(grid, values, row_length)
+        lane = dr.arange(t.UInt, grid.level_count * grid.sources * entries)
         entry, node = lane % entries, lane // entries
-        source, k = node % grid.sources, node // grid.sources
+        source, level = node % grid.sources, node // grid.sources
         taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
         sign = dr.gather(t.Float, _parity(grid, self.degree), entry) if entries > 1 else 1.0
-        places = [((k * suns + at) * entries + entry) * channels for at in taps.at]
+        places = [level * row_length + (at * entries + entry) * channels for at in taps.at]
         return stored(
             [taps.sum([dr.gather(t.Float, values, place + c) for place in places], sign) for c in range(channels)],
             lane,
@@ -69,7 +72,7 @@ class Field:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
         if self.scatters and self.optics.scatterers:
             dr.eval(self._tables)
-        dr.eval(self._irradiances)
+        dr.eval(self._irradiances, self._guide)
 
     @cached_property
     def _tables(self) -> tuple[Any, Any, Any, Any]:
@@ -82,6 +85,15 @@ class Field:
             floats(rows),
             floats(l_),
         )
+
+    @cached_property
+    def _guide(self) -> Any:
+        """The reference at refined levels, interpolated in its logarithm."""
+        logs = dr.log(dr.maximum(self.reference.fine, 1e-37))
+        dr.eval(logs)
+        guide = dr.exp(_between_levels(self.grid, logs, dr.width(logs) // self.grid.shape[0]))
+        dr.eval(guide)
+        return guide
 
     @cached_property
     def _irradiances(self) -> tuple[Any, Any]:
@@ -97,7 +109,7 @@ class Field:
         first = k * suns + s
         nodes = [first, first + 1, first + suns, first + suns + 1]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
-        return nodes, weights, [self.reference.at(level, x, active) for level in (k, k + 1)]
+        return nodes, weights, [self.reference.at(level, x, active, self._guide) for level in (k, k + 1)]
 
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
@@ -114,7 +126,7 @@ class Field:
         buffer = self._irradiances[int(reflected)]
         logs = []
         for level in (k, k + 1):
-            guide = self.reference.at(level, x, active)
+            guide = self.reference.at(level, x, active, self._guide)
             values = [packet(buffer, level * suns + s + i, size, active) for i in (0, 1)]
             logs.append(
                 [dr.log(guide[c] * dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30)) for c in channels]
@@ -320,6 +332,28 @@ def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: in
     fading = dr.ravel(t.ArrayXf(values), order="F")
     dr.eval(size, fading)
     return size, fading
+
+
+def _between_levels(grid: Grid, values: Any, length: int) -> Any:
+    """[K, length] -> [levels, length]: cubic in the altitude coordinate."""
+    t = types()
+
+    def taps() -> tuple[Any, Any]:
+        level = np.arange(grid.level_count) / grid.refine
+        first = np.clip(np.floor(level).astype(int) - 1, 0, max(grid.shape[0] - 4, 0))
+        nodes = (first[:, None] + np.arange(min(4, grid.shape[0]))).astype(float)
+        return uints(first), floats(lagrange(nodes, level))
+
+    first, weights = grid.kept("between levels", taps)
+    lane = dr.arange(t.UInt, grid.level_count * length)
+    level, place = lane // length, lane % length
+    start, count = dr.gather(t.UInt, first, level), min(4, grid.shape[0])
+    total = 0.0
+    for i in range(count):
+        value = dr.gather(t.Float, values, (start + i) * length + place)
+        total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
+    dr.eval(total)
+    return total
 
 
 def _degrees(grid: Grid, degree: int) -> Any:

@@ -32,8 +32,8 @@ class Grid:
     """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
 
     Orders >= 2 are solved at ``theta``; order 1, which knows the edge of the shadow, at ``first_theta``, several times
-    as many suns. Between suns light is interpolated cubically; ``sources`` are refined suns on which the result is
-    tabulated, so that it can be looked up linearly. ``suns``: the range of sun zenith angles (radians, at the observer)
+    as many suns. Between nodes light is interpolated cubically; ``sources`` and ``level_count`` are refined suns and
+    altitudes on which the result is tabulated, so that it can be looked up linearly. ``suns``: the range of sun zenith angles (radians, at the observer)
     that is wanted; the nodes then are those of the full grid that can matter for it.
     """
 
@@ -66,7 +66,7 @@ class Grid:
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
         self._kept: dict[Any, Any] = {}
-        self._place_altitudes(atmosphere, resolution.altitudes)
+        self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine)
         self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
 
     def kept(self, key: Any, make: Callable[[], Any]) -> Any:
@@ -81,7 +81,7 @@ class Grid:
         _collect(vars(self), found, set())
         return list(found.values())
 
-    def _place_altitudes(self, atmosphere: Atmosphere, count: int) -> None:
+    def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
         # Samples dense near the ground, so that a thin layer there is resolved too.
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 2
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
@@ -105,6 +105,7 @@ class Grid:
         u = np.concatenate([[0.0], np.cumsum(rise)])
         self._u, self._h_of_u = u * ((count - 1) / u[-1]), h
         self.h = self.levels_at(1)
+        self.refine, self.level_count = refine, refine * (count - 1) + 1
 
     def extinction_bound(self, h: np.ndarray) -> np.ndarray:
         """Extinction coefficient (1/m) at altitudes ``h`` of the most opaque atmosphere that shares this grid; at most
@@ -171,7 +172,7 @@ class Grid:
         position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return split(dr.lerp(u0, u1, position - t.Float(cell)), self.shape[0])
+        return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self.level_count)
 
     @cached_property
     def _sun_map(self) -> list[Any]:

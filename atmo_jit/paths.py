@@ -145,7 +145,7 @@ class Paths:
             levels = np.concatenate([levels, np.where(at_perigee, perigee[:, None], h[:, None])[ray, column][apart]])
         else:
             around = np.clip(below - 1, 0, max(count - 4, 0))[:, None] + np.arange(min(count, 4))
-            shares = _lagrange(around.astype(float), u)
+            shares = lagrange(around.astype(float), u)
             station, place = np.nonzero(np.where(apart[:, None], np.abs(shares) > 0.0, around == np.round(u)[:, None]))
             level, factor = around[station, place], np.where(apart[station], shares[station, place], 1.0)
         first = np.concatenate([[0], np.cumsum(reached.sum(axis=1))])
@@ -211,7 +211,7 @@ class Paths:
         at = behind[:, None] + np.arange(-1, 3)
         there = np.clip(at, 0, self.count - 1)
         held = (there == at) & (self.ray[there] == self.ray[behind][:, None])
-        return _lagrange(np.where(held, self.distance[there], np.nan), distance)
+        return lagrange(np.where(held, self.distance[there], np.nan), distance)
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
         radius = self.grid.radius_m
@@ -260,7 +260,7 @@ class Points:
         )
 
 
-def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Weights [N, n] of values at ``nodes`` [N, n] (NaN: there is none) in the polynomial through them at ``at`` [N]."""
     held = np.isfinite(nodes)
     weights = np.where(held, 1.0, 0.0)

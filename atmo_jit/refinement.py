@@ -80,13 +80,14 @@ class Reference:
         """Place of ``inverse`` at an altitude node and a solved sun."""
         return (k * len(self.grid.first_theta) + sun * self.grid.first) * self.channels + channel
 
-    def at(self, level: Any, x: Any, active: Any = True) -> list[Any]:
-        """The reference at a level and a sun coordinate, per channel."""
-        t, fine = types(), FINE * (self.grid.shape[1] - 1) + 1
+    def at(self, level: Any, x: Any, active: Any = True, fine: Any = None) -> list[Any]:
+        """The reference at a level and a sun coordinate, per channel; ``fine``: at other levels than the grid's."""
+        t, suns = types(), FINE * (self.grid.shape[1] - 1) + 1
+        held = self.fine if fine is None else fine
         x = x * float(FINE)
-        s = dr.minimum(t.UInt(x), fine - 2)
+        s = dr.minimum(t.UInt(x), suns - 2)
         f = x - t.Float(s)
-        low, high = (packet(self.fine, level * fine + s + i, 4, active) for i in (0, 1))
+        low, high = (packet(held, level * suns + s + i, 4, active) for i in (0, 1))
         return [dr.fma(f, high[c] - low[c], low[c]) for c in range(self.channels)]
 
 

@@ -33,8 +33,8 @@ class Stage:
 class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
-    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``sun_refine``: parts
-    into which cubic interpolation divides every interval of suns for look-ups. ``stages``: how orders 2, 3, ... are
+    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``,
+    ``sun_refine``: parts into which cubic interpolation divides every interval of altitudes and suns for look-ups. ``stages``: how orders 2, 3, ... are
     solved, the last serves all that follow; ``nodes``: Gauss points per piece of their paths. ``first_*``: the same
     for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there; ``beam_*``:
     altitude levels per interval, azimuths and Gauss points at which sunlight is followed, phase functions apart.
@@ -43,6 +43,7 @@ class Resolution:
 
     altitudes: int = 12
     suns: int = 25
+    refine: int = 2
     sun_refine: int = 4
     first_suns: int = 2
     stages: tuple[Stage, ...] = (Stage(4, 4, 6, 4, 6),)
