@@ -7,6 +7,7 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +26,7 @@ from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
 
-AT_ONCE = 3  # orders computed before the sum is first extrapolated
+AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
 
 def solve(
@@ -121,14 +122,21 @@ class _Steps:
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if self._optics.profiles_differentiable or _differentiable(arguments):
             return function(*arguments)
-        if key in self._recorded:
-            return self._recorded[key](*arguments)
-        if key in self._used:
+        if key not in self._used:
+            self._used.add(key)
+            return function(*arguments)
+        if key not in self._recorded:
             arrays = self._grid.arrays()
             self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
+        # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
+        # collector has to wait.
+        collects = gc.isenabled()
+        gc.disable()
+        try:
             return self._recorded[key](*arguments)
-        self._used.add(key)
-        return function(*arguments)
+        finally:
+            if collects:
+                gc.enable()
 
     def _stage(self, n: int) -> int:
         return min(n - 2, len(self._stages) - 1)
@@ -203,7 +211,7 @@ def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights [N, S, size] of the N orders [N, K, S, pairs, size] whose sum is closest to that of all orders, and its
+    """Weights [N, S, size] of the N orders [N, K, S, moments, size] whose sum is closest to that of all orders, and its
     error.
 
     Reduced-rank extrapolation (Eddy 1979; Sidi 1991), per sun and channel: among the combinations sum_j gamma_j x_j,
@@ -213,18 +221,21 @@ def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
     largest over suns and channels that have light.
     """
     count, _, suns, _, size = orders.shape
-    u = np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1).astype(np.float64)
-    gram = u @ np.swapaxes(u, -1, -2)
-    scale = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
+    u = np.ascontiguousarray(np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1), dtype=np.float64)
+    products = u @ np.swapaxes(u, -1, -2)
+    scale = np.trace(products, axis1=-2, axis2=-1)[..., None, None]
     dark = scale <= 0.0
     # A gram matrix of float32 data knows nothing below 1e-10 of its trace.
-    gram = np.where(dark, np.eye(count), gram / np.where(dark, 1.0, scale) + 1e-10 * np.eye(count))
+    gram = np.where(dark, np.eye(count), products / np.where(dark, 1.0, scale) + 1e-10 * np.eye(count))
     gamma = np.linalg.solve(gram, np.ones((suns, size, count, 1)))[..., 0]
     gamma = gamma / gamma.sum(axis=-1, keepdims=True)
     # x_j holds the orders before the j-th, so an order counts in every later partial sum.
     weights = 1.0 - np.cumsum(gamma, axis=-1)
-    residual = np.linalg.norm(np.einsum("scn,scnv->scv", gamma, u), axis=-1)
-    whole = np.linalg.norm(np.einsum("scn,scnv->scv", weights, u), axis=-1) + np.linalg.norm(u[:, :, 0], axis=-1)
+
+    def norm(combination: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", combination, products, combination), 0.0))
+
+    residual, whole = norm(gamma), norm(weights) + np.sqrt(products[..., 0, 0])
     weights = weights + gamma  # the residual is the next term of the sum: take it too
     error = np.divide(residual, whole, out=np.zeros_like(residual), where=whole > 0.0)
     return np.moveaxis(weights, -1, 0), float(error.max())

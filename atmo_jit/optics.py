@@ -17,6 +17,7 @@ import numpy as np
 from .atmosphere import Atmosphere, Constituent
 from .backend import channels, parameter, table
 from .profile import Exponential, Tabulated, Tent
+from .resolution import moments_of
 
 FEW_CORNERS = 8
 PHASE_NODES = 257
@@ -125,7 +126,7 @@ class Optics:
 
     def _moments(self, constituent: int, degree: int) -> list[np.ndarray]:
         phase = self.constituents[constituent].phase
-        return [_moments_of(phase.at(int(i)), degree) for i in self.indices]
+        return [moments_of(phase.at(int(i)), degree) for i in self.indices]
 
     @cached_property
     def profiles_differentiable(self) -> bool:
@@ -170,11 +171,6 @@ class Optics:
             if isinstance(profile, Tabulated):
                 kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
         return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
-
-
-@lru_cache(maxsize=256)
-def _moments_of(phase: Any, degree: int) -> np.ndarray:
-    return np.asarray(phase.moments(degree))
 
 
 @lru_cache(maxsize=16)

@@ -14,7 +14,10 @@ import numpy as np
 from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
-DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
+REMEMBERED = 64  # phase functions whose moments are kept
+REACH_DEGREE = 40  # of the moments that are kept
 
 
 @dataclass(frozen=True)
@@ -45,19 +48,19 @@ class Resolution:
     suns: int = 25
     refine: int = 2
     sun_refine: int = 4
-    first_suns: int = 2
+    first_suns: int = 1
     stages: tuple[Stage, ...] = (Stage(4, 4, 6, 4, 6),)
-    nodes: int = 3
+    nodes: int = 2
     first_up: int = 10
     first_down: int = 8
     first_azimuths: int = 14
     first_degree: int = 12
     phase_degree: int = 16
-    beam_refine: int = 6
-    beam_azimuths: int = 5
-    beam_nodes: int = 3
+    beam_refine: int = 2
+    beam_azimuths: int = 4
+    beam_nodes: int = 2
     orders: int = 40
-    converged: float = 0.1
+    converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
 
     @property
@@ -72,27 +75,36 @@ class Resolution:
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter.
         """
-        first = _degree(atmosphere, power=2.0, target=0.1 * tolerance)
-        later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
+        first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
+        later = min(_degree(atmosphere, 2, 3, 0.02 * tolerance), first)
         if float(np.max(_depth(atmosphere))) > CLOUD:  # so many orders that no single one keeps its direction
             first, later = min(first, 16), min(later, 8)
-        fine = tolerance < 0.005
+        first = next(degree for degree in FIRST_DEGREES if degree >= first)
+        stages = [_stage(later), _stage((3 * later) // 4)]
+        level = int(np.searchsorted(-np.array(FINER), -tolerance))
         return cls(
-            altitudes=_altitudes(atmosphere, 16 if fine else 12),
-            stages=(
-                Stage(later, later, later + (4 if later > 6 else 2), max(4, (4 * later) // 5 + 2), max(later, first // 2) + 1),
-            ),
-            first_up=max(10, first + 2 if first > 12 else first),
-            first_down=max(8, first if first > 12 else first - 2),
+            altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level]),
+            suns=(21, 25, 29, 33)[level],
+            stages=tuple(stages if stages[0] != stages[1] else stages[:1]),
+            first_up=max(10, first),
+            first_down=max(8, first - 2),
             first_azimuths=first + 4,
             first_degree=first,
             phase_degree=max(16, first + 4),
         )
 
 
-def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
-    """Smallest offered degree beyond which share * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
-    scatterer."""
+def _stage(degree: int) -> Stage:
+    """Directions for moments up to ``degree``: light varies less with azimuth than with the angle from the zenith,
+    which has the horizon in it."""
+    degree = max(degree, 2)
+    most = max(2, degree // 4 * 2)
+    return Stage(degree, most, max(5, degree + 2), max(3, degree), most + 1 + (most == 2))
+
+
+def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> int:
+    """Smallest degree >= 2 beyond which share^events * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
+    scatterer; at most the largest offered."""
     needed = 2
     for constituent in atmosphere.constituents:
         if constituent.phase is None:
@@ -101,11 +113,24 @@ def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
         depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
         share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
         for wavelength in range(len(atmosphere.wavelengths_nm)):
-            chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
-            term = share[wavelength] * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
+            chi = np.abs(moments_of(constituent.phase.at(wavelength), FIRST_DEGREES[-1]))
+            term = share[wavelength] ** events * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
             above = np.nonzero(term > target)[0]
             needed = max(needed, int(above[-1]) if len(above) else 0)
-    return next((degree for degree in DEGREES if degree >= needed), DEGREES[-1])
+    return needed
+
+
+def moments_of(phase: Any, degree: int) -> np.ndarray:
+    """Legendre moments of a phase function at one wavelength, kept."""
+    key = (type(phase), float(phase.g)) if hasattr(phase, "g") else phase
+    if key not in _moments:
+        while len(_moments) >= REMEMBERED:
+            _moments.pop(next(iter(_moments)))
+        _moments[key] = np.asarray(phase.moments(REACH_DEGREE))
+    return _moments[key][: degree + 1]
+
+
+_moments: dict[Any, np.ndarray] = {}
 
 
 def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
