@@ -61,9 +61,11 @@ def solve(
         weights = arriving.copy()
         weights[-1] = 0.0
     shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
-    parts = steps.finish(values, done, later, shares)
+    moments, sky, reflected = steps.finish(values, done, later, shares)
+    if orders == 1:
+        reflected = 0.0 * reflected  # the reflection would be the second event
     reference = Reference.of(grid, optics.channel_count, done["reference"])
-    return Field(optics, columns, grid, reference, resolution.first_degree, *parts, scatters=orders != 1)
+    return Field(optics, columns, grid, reference, resolution.first_degree, moments, sky, reflected, scatters=orders != 1)
 
 
 class _Steps:

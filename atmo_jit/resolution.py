@@ -85,6 +85,7 @@ class Resolution:
         return cls(
             altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level]),
             suns=(21, 25, 29, 33)[level],
+            first_suns=(1, 2, 2, 2)[level],
             stages=tuple(stages if stages[0] != stages[1] else stages[:1]),
             first_up=max(10, first),
             first_down=max(8, first - 2),
