@@ -6,7 +6,7 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -124,6 +124,18 @@ def row(buffer: Any, index: Any, count: int, length: int | None = None, active: 
 def table_of(values: Sequence[Any], lane: Any) -> Any:
     """Floats of one width as a table of rows, one per lane, evaluated."""
     return stored(values, lane, row_size(len(values)))
+
+
+class Keeper:
+    """Something that keeps what was made from it: ``_kept``, a dictionary."""
+
+    _kept: dict[Any, Any]
+
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What ``make`` returns, made once."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
 
 
 def table(values: Any) -> Any:

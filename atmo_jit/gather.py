@@ -24,7 +24,7 @@ from .harmonics import legendre, pair_index, pairs
 from .march import relative_azimuth
 from .optics import Optics
 from .path_weights import PathWeights
-from .paths import Directions, paths_along
+from .paths import Directions, Paths, paths_along
 from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
@@ -95,7 +95,11 @@ class Gather:
         """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
         t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
         orders = min(light.most, self.most) + 1
-        table, device, per_visit = self._contract(light, orders), self.paths.device, suns * azimuths
+        weights = weight_rows(
+            self.optics, self.paths, self.held["scattered"], self.held["reflected"], light.degree, orders
+        )
+        table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
+        device, per_visit = self.paths.device, suns * azimuths
         lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
         start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
@@ -104,20 +108,8 @@ class Gather:
             place = i * per_visit + sample
             x, cos_phi = packet(self.samples.place, place, 2)
             scale = packet(self.held["scale"], place, 4)
-            s = dr.minimum(t.UInt(x), suns - 2)
-            taps = cubic(x - t.Float(s))
             # The table has one more sun before the first and after the last.
-            corners = [row(table, i * (suns + 2) + s + n, orders * channels) for n in range(4)]
-            cos_m, cos_before = 1.0, cos_phi
-            inner = [0.0] * channels
-            for m in range(orders):
-                for c in range(channels):
-                    j = m * channels + c
-                    value = taps[0] * corners[0][j]
-                    for n in range(1, 4):
-                        value = dr.fma(taps[n], corners[n][j], value)
-                    inner[c] = value if m == 0 else dr.fma(value, cos_m, inner[c])
-                cos_m, cos_before = dr.fma(2.0 * cos_phi, cos_m, -cos_before), cos_m
+            inner = seen(table, i * (suns + 2), x, suns, cos_phi, orders, channels)
             return i + 1, [dr.fma(scale[c], inner[c], sums[c]) for c in range(channels)]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
@@ -140,65 +132,6 @@ class Gather:
         end = dr.opaque(t.UInt, azimuths, 1)
         _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="azimuths")
         return stored_harmonics(sums, azimuths)
-
-    def _contract(self, light: Moments, orders: int) -> Any:
-        """G [visits, S + 2, m x channels] over the reference: ``light`` seen along each path, weighed and summed over
-        l."""
-        t, channels, suns = types(), self.optics.channel_count, self.grid.shape[1] + 2
-        moments, weights = self._rows(light, orders), self._weight_rows(light.degree, orders)
-        count, width, rows = len(self.paths.station), orders * channels, light.degree + 2
-        lane = dr.arange(t.UInt, count * suns)
-        sun, visit = lane % suns, lane // suns
-        node = dr.gather(t.UInt, self.paths.device.level, visit) * suns + sun
-
-        def add(l_: Any, sums: list[Any], entries: int = width) -> tuple[Any, list[Any]]:
-            weight = row(weights, visit * rows + l_, entries, width)
-            value = row(moments, node * rows + l_, entries, width)
-            return l_ + 1, [
-                dr.fma(w, v, s) for w, v, s in zip(weight, value, sums[:entries], strict=True)
-            ] + sums[entries:]
-
-        sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
-        if rows <= FEW_ROWS:
-            for l_ in range(rows):
-                # Degree l has l + 1 harmonics; the irradiance comes last, in the first place.
-                entries = channels if l_ == rows - 1 else min(l_ + 1, orders) * channels
-                _, sums = add(l_, sums, entries)
-        else:
-            end = dr.opaque(t.UInt, rows, 1)
-            _, sums = dr.while_loop((t.UInt(0), sums), lambda i, _: i < end, add, max_iterations=-1, label="contract")
-        return table_of(sums, lane)
-
-    def _weight_rows(self, degree: int, orders: int) -> Any:
-        """What a moment counts at each visit, table [visits, l, m x channels]: harmonic times weight times phase
-        moment; after the last l the ground's part of the irradiance."""
-        t, channels, kinds = types(), self.optics.channel_count, len(self.optics.scatterers)
-        rows = degree + 2
-
-        def harmonics() -> Any:
-            values = legendre(degree, self.paths.mu[self.paths.station])
-            out = np.zeros((len(values), rows, orders))
-            for place, (l_, m) in enumerate(zip(*pairs(degree), strict=True)):
-                if m < orders:
-                    out[:, l_, m] = values[:, place]
-            return table(out)
-
-        basis = self.grid.kept(("harmonics", self.paths, degree, orders), harmonics)
-        chi = self.optics.phase_moments(degree + 1)
-        lane = dr.arange(t.UInt, len(self.paths.station) * rows)
-        l_, visit = lane % rows, lane // rows
-        products = [0.0] * channels
-        if kinds:
-            weight, moment = row(self.held["scattered"], visit, kinds * channels), row(chi, l_, kinds * channels)
-            for n in range(kinds):
-                products = [
-                    dr.fma(weight[n * channels + c], moment[n * channels + c], products[c]) for c in range(channels)
-                ]
-        values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
-        last = l_ == rows - 1
-        reflected = row(self.held["reflected"], visit, channels, active=last)
-        values[:channels] = [dr.select(last, r, v) for r, v in zip(reflected, values, strict=False)]
-        return table_of(values, lane)
 
     def _rows(self, light: Moments, orders: int) -> Any:
         """Moments over the reference as a table [K, S + 2, l, m x channels], irradiance after the last l.
@@ -237,3 +170,80 @@ class Gather:
         values = value * inverse * mirrored
         dr.eval(values)
         return values
+
+
+def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:
+    """Sum over m of cos(m phi) times a table [suns + 2, m x channels], from row ``first`` on, cubic at the sun
+    coordinate ``x``."""
+    t = types()
+    s = dr.minimum(t.UInt(x), suns - 2)
+    taps = cubic(x - t.Float(s))
+    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    cos_m, cos_before = 1.0, cos_phi
+    total = [0.0] * channels
+    for m in range(orders):
+        for c in range(channels):
+            j = m * channels + c
+            value = taps[0] * corners[0][j]
+            for n in range(1, 4):
+                value = dr.fma(taps[n], corners[n][j], value)
+            total[c] = value if m == 0 else dr.fma(value, cos_m, total[c])
+        cos_m, cos_before = dr.fma(2.0 * cos_phi, cos_m, -cos_before), cos_m
+    return total
+
+
+def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int, orders: int, channels: int) -> Any:
+    """G, table [visits, suns, m x channels]: ``moments`` [K, suns, l, m x channels] seen along each path, weighed by
+    ``weights`` [visits, l, m x channels] and summed over l."""
+    t, rows, width = types(), degree + 2, orders * channels
+    lane = dr.arange(t.UInt, len(paths.station) * suns)
+    sun, visit = lane % suns, lane // suns
+    node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun
+
+    def add(l_: Any, sums: list[Any], entries: int = width) -> tuple[Any, list[Any]]:
+        weight = row(weights, visit * rows + l_, entries, width)
+        value = row(moments, node * rows + l_, entries, width)
+        return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums[:entries], strict=True)] + sums[entries:]
+
+    sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+    if rows <= FEW_ROWS:
+        for l_ in range(rows):
+            # Degree l has l + 1 harmonics; the irradiance comes last, in the first place.
+            _, sums = add(l_, sums, channels if l_ == rows - 1 else min(l_ + 1, orders) * channels)
+    else:
+        end = dr.opaque(t.UInt, rows, 1)
+        _, sums = dr.while_loop((t.UInt(0), sums), lambda i, _: i < end, add, max_iterations=-1, label="contract")
+    return table_of(sums, lane)
+
+
+def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, degree: int, orders: int) -> Any:
+    """What a moment counts at each visit, table [visits, l, m x channels]: harmonic times weight times phase moment;
+    after the last l the ground's part of the irradiance (None: left out)."""
+    t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
+    rows = degree + 2
+
+    def harmonics() -> Any:
+        values = legendre(degree, paths.mu[paths.station])
+        out = np.zeros((len(values), rows, orders))
+        for place, (l_, m) in enumerate(zip(*pairs(degree), strict=True)):
+            if m < orders:
+                out[:, l_, m] = values[:, place]
+        return table(out)
+
+    basis = paths.kept(("harmonics", degree, orders), harmonics)
+    chi = optics.phase_moments(degree + 1)
+    lane = dr.arange(t.UInt, len(paths.station) * rows)
+    l_, visit = lane % rows, lane // rows
+    products = [0.0] * channels
+    if kinds:
+        weight, moment = row(scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
+        for n in range(kinds):
+            products = [
+                dr.fma(weight[n * channels + c], moment[n * channels + c], products[c]) for c in range(channels)
+            ]
+    values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
+    if reflected is not None:
+        last = l_ == rows - 1
+        ground = row(reflected, visit, channels, active=last)
+        values[:channels] = [dr.select(last, r, v) for r, v in zip(ground, values, strict=False)]
+    return table_of(values, lane)

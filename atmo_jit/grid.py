@@ -9,7 +9,6 @@ the twilight.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -18,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
-from .backend import floats, parameter, types
+from .backend import Keeper, floats, parameter, types
 from .profile import Tabulated
 from .resolution import Resolution, column_of
 
@@ -28,7 +27,7 @@ REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 
 
-class Grid:
+class Grid(Keeper):
     """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
 
     Orders >= 2 are solved at ``theta``; order 1, which knows the edge of the shadow, at ``first_theta``, several times
@@ -68,12 +67,6 @@ class Grid:
         self._kept: dict[Any, Any] = {}
         self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine)
         self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
-
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What ``make`` returns, made once for this grid."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        return self._kept[key]
 
     def arrays(self) -> list[Any]:
         """Every Dr.Jit array that is kept, once."""

@@ -27,10 +27,10 @@ class Columns:
 
 
 def columns_along(optics: Optics, points: Points) -> Columns:
-    """Densities and columns at the points of the paths, kept with the grid unless the profiles carry derivatives."""
+    """Densities and columns at the points of the paths, kept with them unless the profiles carry derivatives."""
     if optics.profiles_differentiable:
         return _columns_along(optics, points)
-    return points.paths.grid.kept(("columns", points), lambda: _columns_along(optics, points))
+    return points.paths.kept(("columns", points.nodes), lambda: _columns_along(optics, points))
 
 
 def _columns_along(optics: Optics, points: Points) -> Columns:

@@ -8,13 +8,14 @@ zenith cosine there, angle travelled about the planet's centre) is independent o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
-from .backend import floats, table, uints
+from .backend import Keeper, floats, table, uints
 from .grid import Grid
 from .quadrature import gauss_legendre, running_integral, split_directions
 
@@ -41,7 +42,7 @@ class Directions:
 
 
 @dataclass(frozen=True, eq=False)
-class Paths:
+class Paths(Keeper):
     """Stations of all rays (k, direction), concatenated ray after ray: T stations in all, N rays.
 
     ``first`` [N + 1]: where each ray's stations start. Per station: ``ray``, ``distance`` (m) from the ray's origin,
@@ -72,6 +73,7 @@ class Paths:
     level: np.ndarray
     factor: np.ndarray
     first_visit: np.ndarray
+    _kept: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def device(self) -> SimpleNamespace:
@@ -288,5 +290,5 @@ def paths_along(grid: Grid, directions: Directions, refine: int, *, of_their_own
 
 
 def points_along(paths: Paths, nodes: int) -> Points:
-    """Gauss points along paths, kept with the grid."""
-    return paths.grid.kept(("points", paths, nodes), lambda: paths.points(nodes))
+    """Gauss points along paths, kept with them."""
+    return paths.kept(("points", nodes), lambda: paths.points(nodes))

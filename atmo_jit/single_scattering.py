@@ -49,7 +49,8 @@ class Sunbeam:
         if optics.profiles_differentiable:
             held = beams()
         else:
-            held = paths.grid.kept(("sunbeams", paths), beams)
+            keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
+            held = keeper.kept(("sunbeams", paths.refine), beams)
         lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
         seen, *column = row(held, lane, 1 + kinds)
         depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
