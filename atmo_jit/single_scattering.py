@@ -81,21 +81,22 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
     paths = paths_along(grid, directions, r.beam_refine, of_their_own=True)
     weights = PathWeights(optics, paths, r.beam_nodes)
     beam = Sunbeam(optics, columns, paths)
-    glow = _beam_along(optics, beam, paths, weights, grid, r.beam_azimuths)
+    glow = beam_along(optics, beam, paths, weights, _suns(grid), r.beam_azimuths)
     return _times_phase(optics, *glow, grid, directions, r)
 
 
-def _beam_along(
-    optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, grid: Grid, azimuths: int
+def beam_along(
+    optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, theta: Any, azimuths: int
 ) -> tuple[Any, Any]:
     """Sunlight scattered along the paths without the phase functions, a table [rays, suns, azimuths x scatterers x
-    channels], and light from the ground, [rays, suns, azimuths x channels]."""
+    channels], and light from the ground, [rays, suns, azimuths x channels]. ``theta`` [suns, 2]: cosine and sine of
+    the sun's zenith angle where the paths start."""
     t = types()
     channels, kinds = optics.channel_count, len(optics.scatterers)
-    suns = room(len(grid.first_theta))
+    suns = dr.width(theta) // 2
     lane = dr.arange(t.UInt, len(paths.h) * suns)
     sun, ray = lane % suns, lane // suns
-    mu_s, sin_s = packet(_suns(grid), sun, 2)
+    mu_s, sin_s = packet(theta, sun, 2)
     across = [sin_s * float(c) for c in np.cos(half_circle(azimuths))]
     device = paths.device
     start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
