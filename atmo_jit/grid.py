@@ -32,8 +32,8 @@ class Grid(Keeper):
 
     Orders >= 2 are solved at ``theta``; order 1, which knows the edge of the shadow, at ``first_theta``, several times
     as many suns. Between nodes light is interpolated cubically; ``sources`` and ``level_count`` are refined suns and
-    altitudes on which the result is tabulated, so that it can be looked up linearly. ``suns``: the range of sun zenith angles (radians, at the observer)
-    that is wanted; the nodes then are those of the full grid that can matter for it.
+    altitudes on which the result is tabulated, so that it can be looked up linearly. ``suns``: the range of sun zenith
+    angles (radians, at the observer) that is wanted; the nodes then are those of the full grid that can matter for it.
     """
 
     _known: ClassVar[OrderedDict[Any, Grid]] = OrderedDict()

@@ -16,7 +16,7 @@ import numpy as np
 
 from .backend import floats, types
 from .column import SunColumns
-from .field import Field, total_of
+from .field import Field
 from .gather import Gather
 from .grid import Grid
 from .optics import Optics
@@ -25,6 +25,7 @@ from .projection import Moments, Projection
 from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
+from .total import total_of
 
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
@@ -65,7 +66,8 @@ def solve(
     if orders == 1:
         reflected = 0.0 * reflected  # the reflection would be the second event
     reference = Reference.of(grid, optics.channel_count, done["reference"])
-    return Field(optics, columns, grid, reference, resolution.first_degree, moments, sky, reflected, scatters=orders != 1)
+    degree, again = resolution.first_degree, orders != 1
+    return Field(optics, columns, grid, reference, degree, moments, sky, reflected, scatters=again)
 
 
 class _Steps:

@@ -227,9 +227,9 @@ class Paths(Keeper):
 class Points:
     """Gauss points along paths, in sets of ``nodes``: one set for every part of a piece.
 
-    Per point: altitude ``h`` (m), ``length`` of its part and ``weight`` (m), and the ``shares`` [points, 4] that stations have
-    in what happens there, two behind and two ahead. ``first_part`` [T + 1]: where the
-    parts of the piece after each station start; ``part_ray``.
+    Per point: altitude ``h`` (m), ``length`` of its part and ``weight`` (m), and the ``shares`` [points, 4] that
+    stations have in what happens there, two behind and two ahead. ``first_part`` [T + 1]: where the parts of the piece
+    after each station start; ``part_ray``.
     """
 
     paths: Paths
@@ -263,7 +263,7 @@ class Points:
 
 
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Weights [N, n] of values at ``nodes`` [N, n] (NaN: there is none) in the polynomial through them at ``at`` [N]."""
+    """Weights [N, n] of values at ``nodes`` [N, n] (NaN: there is none) in the polynomial through them, at ``at``."""
     held = np.isfinite(nodes)
     weights = np.where(held, 1.0, 0.0)
     for i in range(nodes.shape[1]):

@@ -37,11 +37,13 @@ class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
     ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``,
-    ``sun_refine``: parts into which cubic interpolation divides every interval of altitudes and suns for look-ups. ``stages``: how orders 2, 3, ... are
-    solved, the last serves all that follow; ``nodes``: Gauss points per piece of their paths. ``first_*``: the same
-    for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase functions there; ``beam_*``:
-    altitude levels per interval, azimuths and Gauss points at which sunlight is followed, phase functions apart.
-    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
+    ``sun_refine``: parts into which cubic interpolation divides every interval of altitudes and suns for look-ups.
+    ``stages``: how orders 2, 3, ... are solved, the last serves all that follow; ``nodes``: Gauss points per piece of
+    their paths. ``first_*``: the same for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase
+    functions there; ``beam_*``: altitude levels per interval, azimuths and Gauss points at which sunlight is followed,
+    phase functions apart.
+    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``:
+    size of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
@@ -136,7 +138,8 @@ _moments: dict[Any, np.ndarray] = {}
 
 def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
-    scattering = sum((c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
+    scattering = sum(depths, start=np.zeros(1))
     extra = 8.0 * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
     return min(clear + 4 * int(np.ceil(extra / 4.0)), 40)
 

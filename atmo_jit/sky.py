@@ -134,8 +134,8 @@ class Sky:
         """Radiance for every combination of P views, S suns and A azimuths, far faster than ray by ray (bundle.py).
 
         ``altitude_m`` (0 to the top of the air) and ``view_zenith`` [P]: where rays start, and their zenith angle
-        there; ``sun_zenith`` [S] at the start, ``azimuth`` [A] of the view minus that of the sun, or [P, S, A]; radians.
-        Radiance comes as W Floats [P, S, A] flattened, transmittance as W Floats [P].
+        there; ``sun_zenith`` [S] at the start, ``azimuth`` [A] of the view minus that of the sun, or [P, S, A];
+        radians. Radiance comes as W Floats [P, S, A] flattened, transmittance as W Floats [P].
         """
         view, height, sun = (np.atleast_1d(np.asarray(v, float)) for v in (view_zenith, altitude_m, sun_zenith))
         height, view = np.broadcast_arrays(height, view)
