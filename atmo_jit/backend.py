@@ -7,6 +7,7 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -31,7 +32,12 @@ def types() -> ModuleType:
 
     Raises LLVMError when the LLVM backend is selected and no usable libLLVM is there.
     """
-    if _selected == "cuda":
+    return _module(_selected)
+
+
+@lru_cache(maxsize=2)
+def _module(name: str) -> ModuleType:
+    if name == "cuda":
         import drjit.cuda.ad as module
     else:
         from .llvm import require_llvm
@@ -141,8 +147,9 @@ class Keeper:
 def table(values: Any) -> Any:
     """A NumPy array [..., count] as a table of rows."""
     values = np.asarray(values)
-    spare = row_size(values.shape[-1]) - values.shape[-1]
-    return floats(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, spare)]))
+    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.float32)
+    rows[..., : values.shape[-1]] = values
+    return floats(rows)
 
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:

@@ -22,7 +22,7 @@ from .profile import Tabulated
 from .resolution import Resolution, column_of
 
 _FINE = 2048
-REACH = 2.0  # dips of the horizon beyond the wanted suns that are solved
+REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 

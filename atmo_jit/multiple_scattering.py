@@ -124,7 +124,7 @@ class _Steps:
         )
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        if self._optics.profiles_differentiable or _differentiable(arguments):
+        if self._optics.profiles_differentiable or dr.grad_enabled(arguments):
             return function(*arguments)
         if key not in self._used:
             self._used.add(key)
@@ -191,14 +191,6 @@ class _Steps:
         first = Moments(first, *self._degree(1), len(grid.first_theta), channels)
         rest = [Moments(v, *self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
         return total_of(optics, self._columns, grid, reference, first, rest, shares)
-
-
-def _differentiable(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(_differentiable(v) for v in value.values())
-    if isinstance(value, (list, tuple)):
-        return any(_differentiable(v) for v in value)
-    return dr.is_array_v(value) and dr.grad_enabled(value)
 
 
 def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:

@@ -115,10 +115,13 @@ def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> i
         # How much of the light they meet these particles scatter.
         depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
         share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
-        for wavelength in range(len(atmosphere.wavelengths_nm)):
-            chi = np.abs(moments_of(constituent.phase.at(wavelength), FIRST_DEGREES[-1]))
-            term = share[wavelength] ** events * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
-            above = np.nonzero(term > target)[0]
+        shares: dict[Any, float] = {}
+        for wavelength, part in enumerate(share.tolist()):
+            phase = constituent.phase.at(wavelength)
+            shares[phase] = max(part, shares.get(phase, 0.0))
+        for phase, part in shares.items():
+            chi = np.abs(moments_of(phase, FIRST_DEGREES[-1]))
+            above = np.flatnonzero(part**events * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0) > target)
             needed = max(needed, int(above[-1]) if len(above) else 0)
     return needed
 
