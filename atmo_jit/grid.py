@@ -2,8 +2,7 @@
 needs them.
 
 Altitude nodes are uniform in a coordinate u(h) that grows with the scattering matter passed, flattened so that the
-thin upper air gets its share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta), dense around
-the twilight.
+thin upper air gets its share. Sun nodes are uniform in x(theta), dense around the twilight.
 """
 
 from __future__ import annotations
