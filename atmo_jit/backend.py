@@ -6,7 +6,8 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -31,7 +32,12 @@ def types() -> ModuleType:
 
     Raises LLVMError when the LLVM backend is selected and no usable libLLVM is there.
     """
-    if _selected == "cuda":
+    return _module(_selected)
+
+
+@lru_cache(maxsize=2)
+def _module(name: str) -> ModuleType:
+    if name == "cuda":
         import drjit.cuda.ad as module
     else:
         from .llvm import require_llvm
@@ -108,22 +114,51 @@ def padded(channel_count: int) -> int:
     return 4 if channel_count == 3 else channel_count
 
 
-def scatter_packet(buffer: Any, values: Sequence[Any], index: Any, size: int) -> None:
-    """Write ``values`` to ``size`` consecutive floats from ``index * size``, zeros where there are fewer."""
-    import drjit as dr
+def row_size(count: int) -> int:
+    """Floats stored for a row of ``count``: 1, 2 or 4, then multiples of 8, which load in packets."""
+    return 1 << (count - 1).bit_length() if count <= 4 else -(-count // 8) * 8
 
-    t = types()
-    if size == 1:
-        dr.scatter(buffer, values[0], index)
-    else:
-        dr.scatter(buffer, t.ArrayXf([*values, *[t.Float(0.0)] * (size - len(values))]), index)
+
+def row(buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True) -> list[Any]:
+    """The first ``count`` floats of row ``index`` of a table of rows of ``length`` (default: ``count``)."""
+    size = row_size(length or count)
+    step = min(size, 8)
+    parts = [packet(buffer, index * (size // step) + i, step, active) for i in range(-(-count // step))]
+    return [value for part in parts for value in part][:count]
+
+
+def table_of(values: Sequence[Any], lane: Any) -> Any:
+    """Floats of one width as a table of rows, one per lane, evaluated."""
+    return stored(values, lane, row_size(len(values)))
+
+
+class Keeper:
+    """Something that keeps what was made from it: ``_kept``, a dictionary."""
+
+    _kept: dict[Any, Any]
+
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What ``make`` returns, made once."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+def table(values: Any) -> Any:
+    """A NumPy array [..., count] as a table of rows."""
+    values = np.asarray(values)
+    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.float32)
+    rows[..., : values.shape[-1]] = values
+    return floats(rows)
 
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
     import drjit as dr
 
-    out = dr.zeros(types().Float, dr.width(lane) * size)
-    scatter_packet(out, values, lane, size)
+    t = types()
+    out = dr.zeros(t.Float, dr.width(lane) * size)
+    padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
+    dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
     dr.eval(out)
     return out

@@ -22,6 +22,7 @@ import numpy as np
 
 from .backend import floats, packet, parameter, types
 from .geometry import altitude_along, distance_up, perigee_altitude
+from .grid import Grid
 from .optics import Optics
 from .profile import Exponential
 from .quadrature import gauss_legendre
@@ -54,6 +55,7 @@ class SunColumns:
         self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
         self._table = self._build() if self._count else None
+        dr.eval(self._table)
 
     def _build(self) -> Any:
         t = types()
@@ -121,6 +123,13 @@ class SunColumns:
             mean = dr.lerp(dr.lerp(a[k], b[k], fx), dr.lerp(c[k], d[k], fx), fy)
             result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
         return result
+
+
+def sun_columns(optics: Optics, grid: Grid) -> SunColumns:
+    """The table for an atmosphere, kept with the grid unless the profiles carry derivatives."""
+    if optics.profiles_differentiable:
+        return SunColumns(optics, grid.resolution.columns)
+    return grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
 
 
 def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:

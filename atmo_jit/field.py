@@ -8,25 +8,28 @@ by a factor of two per degree, and linear interpolation of the moments themselve
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, stored, types, uints
+from .backend import floats, packet, padded, row, stored, types, uints
 from .column import SunColumns
-from .grid import Grid
+from .grid import Grid, split
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
-from .refinement import Order, Refinement
+from .paths import lagrange
+from .refinement import Reference, Taps
+from .total import parity
 
 
 class Field:
-    """The light of a sum of orders at the refined nodes.
+    """The light of a sum of orders, at the altitudes of the grid and the suns of order 1, over the reference.
 
-    ``first``: order 1, at its own suns; ``rest``: the sum of the later orders that scatter once more (None: there are
-    none), ``arriving``: their sky irradiance [K, S, size], which may be of one order more. ``scatters``: whether any
-    of it scatters once more.
+    ``moments`` [K, suns, pairs(degree), channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
+    channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above.
+    ``scatters``: whether any of it scatters once more.
     """
 
     def __init__(
@@ -34,72 +37,79 @@ class Field:
         optics: Optics,
         columns: SunColumns,
         grid: Grid,
-        refine: Refinement,
-        first: Order,
-        rest: Order | None,
-        arriving: Any,
+        reference: Reference,
+        degree: int,
+        moments: Any,
+        sky: Any,
+        reflected: Any,
         *,
         scatters: bool = True,
     ) -> None:
-        self.optics, self.columns, self.grid = optics, columns, grid
-        self.log_reference = refine.log_reference
+        self.optics, self.columns, self.grid, self.reference = optics, columns, grid, reference
+        self.degree, self.moments, self.sky, self.reflected = degree, moments, sky, reflected
         self.scatters = scatters
-        suns = len(grid.first_theta), grid.shape[1]
-        once = refine.both(self._per_depth(first.sky, suns[0]), suns[0])
-        self.sky = once if arriving is None else once + refine.both(self._per_depth(arriving, suns[1]), suns[1])
-        if rest is None:
-            self.reflected = dr.zeros(types().Float, dr.width(self.sky))
-            return
-        self.degree = first.degree
-        self.reflected = once + refine.both(self._per_depth(rest.sky, suns[1]), suns[1])
-        self.moments = _sum(
-            refine.both(first.moments, suns[0], first.degree),
-            first,
-            refine.both(rest.moments, suns[1], rest.degree),
-            rest,
+        self._size = padded(optics.channel_count)
+
+    def _refined(self, values: Any, entries: int) -> Any:
+        """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically."""
+        t, grid, channels = types(), self.grid, self.optics.channel_count
+        suns = len(grid.first_theta)
+        row_length = suns * entries * channels
+        values = _between_levels(grid, values, row_length)
+        lane = dr.arange(t.UInt, grid.level_count * grid.sources * entries)
+        entry, node = lane % entries, lane // entries
+        source, level = node % grid.sources, node // grid.sources
+        taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
+        sign = dr.gather(t.Float, parity(grid, self.degree), entry) if entries > 1 else 1.0
+        places = [level * row_length + (at * entries + entry) * channels for at in taps.at]
+        return stored(
+            [taps.sum([dr.gather(t.Float, values, place + c) for place in places], sign) for c in range(channels)],
+            lane,
+            self._size,
         )
-        self._chi = optics.phase_moments(self.degree, padded(optics.channel_count))
+
+    def prepare(self) -> None:
+        """Make the tables for look-ups, which cannot be made while a kernel is traced."""
+        if self.scatters and self.optics.scatterers:
+            dr.eval(self._tables)
+        dr.eval(self._irradiances, self._guide)
+
+    @cached_property
+    def _tables(self) -> tuple[Any, Any, Any, Any]:
+        """Moments at refined suns for look-ups, phase moments, and the recurrences of harmonics."""
         l_, m = pairs(self.degree)
-        rows = [[*row, float(a == b)] for row, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
-        self._recurrence, self._l = floats(rows), floats(l_)
-        dr.eval(self.sky, self.reflected, self.moments)
+        rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+        return (
+            self._refined(self.moments, pair_count(self.degree)),
+            self.optics.phase_moments(self.degree),
+            floats(rows),
+            floats(l_),
+        )
+
+    @cached_property
+    def _guide(self) -> Any:
+        """The reference at refined levels, interpolated in its logarithm."""
+        logs = dr.log(dr.maximum(self.reference.fine, 1e-37))
+        dr.eval(logs)
+        guide = dr.exp(_between_levels(self.grid, logs, dr.width(logs) // self.grid.shape[0]))
+        dr.eval(guide)
+        return guide
+
+    @cached_property
+    def _irradiances(self) -> tuple[Any, Any]:
+        return self._refined(self.sky, 1), self._refined(self.reflected, 1)
 
     def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
         [2][channel]."""
-        suns, size = self.grid.sources, padded(self.optics.channel_count)
+        suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
-        s, fs = self.grid.locate_sun(mu_s)
+        x = self.grid.sun_position(mu_s)
+        s, fs = split(x * float(self.grid.sun_refine), suns)
         first = k * suns + s
         nodes = [first, first + 1, first + suns, first + suns + 1]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
-        logs = [packet(self.log_reference, node, size, active) for node in nodes]
-        channels = range(self.optics.channel_count)
-        return nodes, weights, [[dr.exp(dr.lerp(logs[i][c], logs[i + 1][c], fs)) for c in channels] for i in (0, 2)]
-
-    def _per_depth(self, irradiance: Any, suns: int) -> Any:
-        """Irradiance [K, S, size] over the scattering depth of the air above: finite at the top, where both vanish,
-        and smooth up to it."""
-        t, size = types(), padded(self.optics.channel_count)
-        altitudes = self.grid.shape[0]
-        above = self._depth_above(floats(self.grid.h))
-        per_altitude = stored(
-            [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above],
-            dr.arange(t.UInt, altitudes),
-            size,
-        )
-        row = suns * size
-        lane = dr.arange(t.UInt, altitudes * row)
-        quotient = irradiance * dr.gather(t.Float, per_altitude, lane // row * size + lane % size)
-        dr.eval(quotient)
-        # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
-        end = altitudes * row - row + lane % row
-        near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * row), 1e-30) for n in (1, 2))
-        steady = near * dr.clip(near / far, 0.25, 4.0)
-        return dr.select(lane >= (altitudes - 1) * row, steady, quotient)
-
-    def _depth_above(self, h: Any) -> list[Any]:
-        return self.optics.scattering_depths(self.columns.upward(h))
+        return nodes, weights, [self.reference.at(level, x, active, self._guide) for level in (k, k + 1)]
 
     def irradiance(self, h: Any, mu_s: Any, active: Any = True, *, reflected: bool = False) -> list[Any]:
         """Irradiance of the scattered light on a horizontal surface facing up, per channel.
@@ -111,21 +121,18 @@ class Field:
             return [0.0 * h for _ in channels]
         suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
-        s, fs = self.grid.locate_sun(mu_s)
-        buffer = self.reflected if reflected else self.sky
+        x = self.grid.sun_position(mu_s)
+        s, fs = split(x * float(self.grid.sun_refine), suns)
+        buffer = self._irradiances[int(reflected)]
         logs = []
-        for node in (k * suns + s, (k + 1) * suns + s):
-            guide = [packet(self.log_reference, node + i, size, active) for i in (0, 1)]
-            values = [packet(buffer, node + i, size, active) for i in (0, 1)]
+        for level in (k, k + 1):
+            guide = self.reference.at(level, x, active, self._guide)
+            values = [packet(buffer, level * suns + s + i, size, active) for i in (0, 1)]
             logs.append(
-                [
-                    dr.lerp(guide[0][c], guide[1][c], fs)
-                    + dr.log(dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30))
-                    for c in channels
-                ]
+                [dr.log(guide[c] * dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30)) for c in channels]
             )
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
-        above = self._depth_above(h)
+        above = self.optics.scattering_depths(self.columns.upward(h))
         return [dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
@@ -138,11 +145,12 @@ class Field:
         sine = dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
         count = pair_count(self.degree)
         stride = dr.opaque(t.UInt, count, 1)
+        moments, phases, recurrences, degrees = self._tables
 
         def pair(
             i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]
         ) -> tuple[Any, ...]:
-            a, b, start, is_diagonal = packet(self._recurrence, i, 4, active)
+            a, b, start, is_diagonal = packet(recurrences, i, 4, active)
             new_m = start > 0.0
             diagonal = dr.select(new_m, diagonal * sine * start, diagonal)
             next_cos = dr.select(new_m, 2.0 * cos_phi * cos_m - cos_m1, cos_m)
@@ -150,17 +158,14 @@ class Field:
             value = dr.select(is_diagonal > 0.0, diagonal, a * (mu * last - b * before))
             before = dr.select(is_diagonal > 0.0, 0.0, last)
             basis = value * next_cos
-            corner = [packet(self.moments, node * stride + i, size, active) for node in nodes]
+            corner = [packet(moments, node * stride + i, size, active) for node in nodes]
             moment = [
                 _blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis
                 for c in range(channels)
             ]
-            degree = t.UInt(dr.gather(t.Float, self._l, i, active))
-            chi = packet(self._chi, degree, kinds * size, active)
-            sums = [
-                dr.fma(chi[n], moment[n % size], sums[n]) if n % size < channels else sums[n]
-                for n in range(kinds * size)
-            ]
+            degree = t.UInt(dr.gather(t.Float, degrees, i, active))
+            chi = row(phases, degree, kinds * channels, active=active)
+            sums = [dr.fma(chi[n], moment[n % channels], sums[n]) for n in range(kinds * channels)]
             return i + 1, diagonal, value, before, next_cos, cos_m1, sums
 
         width = dr.width(h)
@@ -174,10 +179,10 @@ class Field:
             zero,
             one,
             cos_phi + zero,
-            [dr.zeros(t.Float, width) for _ in range(kinds * size)],
+            [dr.zeros(t.Float, width) for _ in range(kinds * channels)],
         )
         *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
-        return [[dr.maximum(sums[n * size + c], 0.0) for c in range(channels)] for n in range(kinds)]
+        return [[dr.maximum(sums[n * channels + c], 0.0) for c in range(channels)] for n in range(kinds)]
 
 
 def _blend(weights: list[Any], values: list[Any]) -> Any:
@@ -187,13 +192,23 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
     return total
 
 
-def _sum(moments: Any, order: Order, others: Any, other: Order) -> Any:
-    """``moments`` [nodes, pairs, size] of an order plus those of one of equal or lower degree."""
-    t, size = types(), order.size
-    stored_pairs = [list(zip(*(a.tolist() for a in pairs(o.degree)), strict=True)) for o in (order, other)]
-    place = {pair: i for i, pair in enumerate(stored_pairs[1])}
-    source = np.array([place.get(pair, -1) for pair in stored_pairs[0]])
-    lane = dr.arange(t.UInt, dr.width(moments))
-    pair, node = lane // size % len(source), lane // (size * len(source))
-    there, held = dr.gather(t.UInt, uints(np.maximum(source, 0)), pair), dr.gather(t.UInt, uints(source >= 0), pair) > 0
-    return moments + dr.gather(t.Float, others, (node * len(place) + there) * size + lane % size, held)
+def _between_levels(grid: Grid, values: Any, length: int) -> Any:
+    """[K, length] -> [levels, length]: cubic in the altitude coordinate."""
+    t = types()
+
+    def taps() -> tuple[Any, Any]:
+        level = np.arange(grid.level_count) / grid.refine
+        first = np.clip(np.floor(level).astype(int) - 1, 0, max(grid.shape[0] - 4, 0))
+        nodes = (first[:, None] + np.arange(min(4, grid.shape[0]))).astype(float)
+        return uints(first), floats(lagrange(nodes, level))
+
+    first, weights = grid.kept("between levels", taps)
+    lane = dr.arange(t.UInt, grid.level_count * length)
+    level, place = lane // length, lane % length
+    start, count = dr.gather(t.UInt, first, level), min(4, grid.shape[0])
+    total = 0.0
+    for i in range(count):
+        value = dr.gather(t.Float, values, (start + i) * length + place)
+        total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
+    dr.eval(total)
+    return total

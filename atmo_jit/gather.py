@@ -5,187 +5,245 @@ path's origin is the sum over t and m of cos(m phi_t) G_m(t, s_t). The weights W
 angle s_t and azimuth phi_t at a visit are geometry. Ground reflection joins m = 0 at the last visit of a path that
 ends on the ground. G is tabulated at the solved suns and interpolated cubically between them: its table stays small
 enough for the cache.
+
+A path turns little about the planet's centre, so that what arrives with azimuthal order m left with nearly the same:
+moments of a higher m than the result keeps are left out, of whatever degree they are.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, scatter_packet, stored, types
+from .backend import floats, packet, row, row_size, stored, table, table_of, types, uints
 from .geometry import safe_sine
-from .grid import Grid
-from .harmonics import legendre, pair_count
+from .grid import Grid, cubic
+from .harmonics import legendre, pair_index, pairs
 from .march import relative_azimuth
 from .optics import Optics
 from .path_weights import PathWeights
-from .paths import Directions, paths_along
+from .paths import Directions, Paths, paths_along
+from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
-from .refinement import Order, Refinement
+from .refinement import Reference
+
+FEW_ROWS = 8  # degrees up to which the sum over l is unrolled
 
 
 class Samples:
     """Where sun and azimuth stand at every visit of the paths, for every solved sun and azimuth: geometry that serves
     every order.
 
-    ``sun``: coordinate in units of the solved suns, ``cos_phi``: [visits, S, azimuths].
+    ``place`` [visits, S, azimuths, 2]: sun coordinate and cos phi.
     """
 
     def __init__(self, grid: Grid, directions: Directions, azimuths: int) -> None:
         t = types()
-        self.paths = paths = paths_along(grid, directions, grid.refine)
+        self.paths = paths = paths_along(grid, directions, 1)
         suns, device = grid.shape[1], self.paths.device
         lane = dr.arange(t.UInt, len(paths.station) * suns * azimuths)
         azimuth, rest = lane % azimuths, lane // azimuths
-        sun, station = rest % suns, dr.gather(t.UInt, device.station, rest // suns)
+        sun, visit = rest % suns, rest // suns
         cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
         mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.theta)), sun) for f in (np.cos, np.sin))
-        mu0 = dr.gather(t.Float, device.mu_start, dr.gather(t.UInt, device.ray, station))
-        mu, cos_turn, sin_turn = (dr.gather(t.Float, b, station) for b in (device.mu, device.cos_turn, device.sin_turn))
+        mu0 = dr.gather(t.Float, device.mu_start, dr.gather(t.UInt, device.ray, visit))
+        mu = dr.gather(t.Float, floats(paths.mu[paths.station]), visit)
+        cos_turn, sin_turn = packet(device.turns, visit, 2)
         nu = dr.fma(mu0, mu_s, safe_sine(mu0) * sin_s * cos_phi)
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
-        self.sun = grid.sun_position(turned) / grid.sun_refine
-        self.cos_phi = relative_azimuth(mu, turned, nu)
-        dr.eval(self.sun, self.cos_phi)
-        self._basis: dict[int, Any] = {}
-
-    def basis(self, degree: int) -> Any:
-        """P_lm(mu) at the visits, [visits, pairs]."""
-        if degree not in self._basis:
-            self._basis[degree] = floats(legendre(degree, self.paths.mu[self.paths.station]))
-        return self._basis[degree]
-
-
-@lru_cache(maxsize=16)
-def _samples(grid: Grid, directions: Directions, azimuths: int) -> Samples:
-    return Samples(grid, directions, azimuths)
+        self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
 
 
 class Gather:
-    """The step from one order to the next for one atmosphere."""
+    """The step from one order to the next for one atmosphere, along ``directions`` seen at ``azimuths``; the light that
+    it returns has azimuthal orders up to ``most``. ``held``: what another of the same kind made of the atmosphere."""
 
-    def __init__(self, optics: Optics, grid: Grid, directions: Directions, azimuths: int) -> None:
-        self.optics, self.grid, self.directions, self.azimuths = optics, grid, directions, azimuths
-        self.samples = _samples(grid, directions, azimuths)
+    def __init__(
+        self,
+        optics: Optics,
+        grid: Grid,
+        reference: Reference,
+        directions: Directions,
+        azimuths: int,
+        most: int,
+        nodes: int,
+        held: dict[str, Any] | None = None,
+    ) -> None:
+        self.optics, self.grid, self.reference = optics, grid, reference
+        self.azimuths, self.most = azimuths, most
+        key = ("samples", directions, azimuths)
+        self.samples = grid.kept(key, lambda: Samples(grid, directions, azimuths))
         self.paths = self.samples.paths
-        self.size = padded(optics.channel_count)
-        self._weights = PathWeights(optics, self.paths)
+        if held is None:
+            weights = PathWeights(optics, self.paths, nodes)
+            scale = self._reference_at_samples()
+            held = {"scattered": weights.scattered, "reflected": weights.reflected, "scale": scale}
+        self.held = held
 
-    def __call__(self, refine: Refinement, light: Order) -> Any:
-        """Radiance at the solved nodes, [K, D, S, azimuths, size], of ``light`` after one more event."""
-        t, size, channels = types(), self.size, self.optics.channel_count
-        samples, device, fine = self.samples, self.paths.device, self.grid.sun_refine
-        suns, sources, azimuths, orders = self.grid.shape[1], self.grid.sources, self.azimuths, light.degree + 1
-        contracted = self._contract(refine.altitudes(light.moments), light.sky, light.degree)
-        count = dr.opaque(t.UInt, orders, 1)
-        per_visit = suns * azimuths
+    def _reference_at_samples(self) -> Any:
+        """The reference at every sample, [visits, S, azimuths, 4]."""
+        t = types()
+        count = len(self.paths.station) * self.grid.shape[1] * self.azimuths
+        lane = dr.arange(t.UInt, count)
+        level = dr.gather(t.UInt, self.paths.device.level, lane // (self.grid.shape[1] * self.azimuths))
+        x, _ = packet(self.samples.place, lane, 2)
+        return stored(self.reference.at(level, x), lane, 4)
+
+    def __call__(self, light: Moments) -> Any:
+        """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
+        t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
+        orders = min(light.most, self.most) + 1
+        weights = weight_rows(
+            self.optics, self.paths, self.held["scattered"], self.held["reflected"], light.degree, orders
+        )
+        table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
+        device, per_visit = self.paths.device, suns * azimuths
         lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
         start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
 
         def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             place = i * per_visit + sample
-            x, cos_phi = dr.gather(t.Float, samples.sun, place), dr.gather(t.Float, samples.cos_phi, place)
-            s = dr.minimum(t.UInt(x), suns - 2)
-            taps = _cubic(x - t.Float(s))
+            x, cos_phi = packet(self.samples.place, place, 2)
+            scale = packet(self.held["scale"], place, 4)
             # The table has one more sun before the first and after the last.
-            at = [dr.fma(dr.fma(i, suns + 2, s + n), count, 0) for n in range(4)]
-
-            def harmonic(m: Any, inner: list[Any], cos_m: Any, cos_m1: Any) -> tuple[Any, ...]:
-                corner = [packet(contracted, a + m, size) for a in at]
-                for c in range(channels):
-                    value = taps[0] * corner[0][c]
-                    for tap, values in zip(taps[1:], corner[1:], strict=True):
-                        value = dr.fma(tap, values[c], value)
-                    inner[c] = dr.fma(value, cos_m, inner[c])
-                return m + 1, inner, dr.fma(2.0 * cos_phi, cos_m, -cos_m1), cos_m
-
-            nothing = [0.0 * x for _ in range(channels)]
-            state = (t.UInt(0), nothing, 0.0 * x + 1.0, cos_phi + 0.0)
-            _, inner, _, _ = dr.while_loop(state, lambda m, *_: m < count, harmonic, label="harmonics")
-            x = x * fine
-            s = dr.minimum(t.UInt(x), sources - 2)
-            f = x - t.Float(s)
-            there = dr.gather(t.UInt, device.level, i) * sources + s
-            low, high = packet(refine.log_reference, there, size), packet(refine.log_reference, there + 1, size)
-            scale = [dr.exp(dr.fma(f, high[c] - low[c], low[c])) for c in range(channels)]
+            inner = seen(table, i * (suns + 2), x, suns, cos_phi, orders, channels)
             return i + 1, [dr.fma(scale[c], inner[c], sums[c]) for c in range(channels)]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
-        _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, label="gather")
-        return stored([dr.maximum(s, 0.0) for s in sums], lane, size)
+        _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, max_iterations=-1, label="gather")
+        radiance = stored([dr.maximum(s, 0.0) for s in sums], lane, 4)
+        return self._harmonics(radiance)
 
-    def _contract(self, moments: Any, sky: Any, degree: int) -> Any:
-        """G [visits, S + 2, m, size] over the reference: ``moments`` [levels, S, pairs, size] seen along each path,
-        weighed and summed over l.
+    def _harmonics(self, radiance: Any) -> Any:
+        t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
+        per_ray = room(suns)
+        lane = dr.arange(t.UInt, len(self.paths.h) * per_ray)
+        node = lane // per_ray * suns + dr.minimum(lane % per_ray, suns - 1)
+        cosines = self.grid.kept(("cosines", azimuths), lambda: floats(np.cos(half_circle(azimuths))))
 
-        The first sun mirrors the second (the sun has passed through the zenith: (-1)^m), the last goes straight on.
+        def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            values = packet(radiance, node * azimuths + j, 4)[:channels]
+            return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j))
+
+        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 1) * channels)]
+        end = dr.opaque(t.UInt, azimuths, 1)
+        _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="azimuths")
+        return stored_harmonics(sums, azimuths)
+
+    def _rows(self, light: Moments, orders: int) -> Any:
+        """Moments over the reference as a table [K, S + 2, l, m x channels], irradiance after the last l.
+
+        The first sun mirrors the second (the sun has passed through the zenith: (-1)^m), the last is the one before.
         """
-        t, device, optics = types(), self.paths.device, self.optics
-        size, channels, suns, orders = self.size, optics.channel_count, self.grid.shape[1], degree + 1
-        pair_total, visits, kinds = pair_count(degree), len(self.paths.station), len(optics.scatterers)
-        # Weight times phase moment, [visits, l, size].
-        chi = optics.phase_moments(degree, size)
-        lane = dr.arange(t.UInt, visits * orders)
-        visit, l_ = lane // orders, lane % orders
-        products = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
+        t, channels, grid, degree = types(), self.optics.channel_count, self.grid, light.degree
+        altitudes, suns = grid.shape
+        rows, width = degree + 2, row_size(orders * channels)
+
+        def places() -> tuple[Any, Any, Any]:
+            """Where each entry of a row comes from, and its sign when mirrored; which sun is read."""
+            place, sign = np.full((rows, width), -1), np.ones((rows, width))
+            for l_ in range(degree + 1):
+                for m in range(min(l_ + 1, orders)):
+                    for c in range(channels):
+                        place[l_, m * channels + c] = pair_index(degree, l_, m)
+                        sign[l_, m * channels + c] = (-1.0) ** m if grid.whole_suns else 1.0
+            place[-1, :channels] = light.entries - 1
+            sun = np.arange(suns + 2) - 1
+            sun[0], sun[-1] = int(grid.whole_suns), suns - 1
+            return uints(place + 1), floats(sign), uints(sun)
+
+        place, sign, which = grid.kept(("rows", degree, light.most, orders, channels), places)
+        lane = dr.arange(t.UInt, altitudes * (suns + 2) * rows * width)
+        entry, node = lane % (rows * width), lane // (rows * width)
+        sun, k = node % (suns + 2), node // (suns + 2)
+        there, channel = dr.gather(t.UInt, which, sun), entry % width % channels
+        index = dr.gather(t.UInt, place, entry)
+        held = index > 0
+        every = (light.suns - 1) // (suns - 1)
+        index = light.index(k, dr.maximum(index, 1) - 1, there * every, channel)
+        value = dr.gather(t.Float, light.values, index, held)
+        inverse = dr.gather(t.Float, self.reference.inverse, self.reference.index(k, there, channel), held)
+        mirrored = dr.select(sun == 0, dr.gather(t.Float, sign, entry), 1.0)
+        values = value * inverse * mirrored
+        dr.eval(values)
+        return values
+
+
+def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:
+    """Sum over m of cos(m phi) times a table [suns + 2, m x channels], from row ``first`` on, cubic at the sun
+    coordinate ``x``."""
+    t = types()
+    s = dr.minimum(t.UInt(x), suns - 2)
+    taps = cubic(x - t.Float(s))
+    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    cos_m, cos_before = 1.0, cos_phi
+    total = [0.0] * channels
+    for m in range(orders):
+        for c in range(channels):
+            j = m * channels + c
+            value = taps[0] * corners[0][j]
+            for n in range(1, 4):
+                value = dr.fma(taps[n], corners[n][j], value)
+            total[c] = value if m == 0 else dr.fma(value, cos_m, total[c])
+        cos_m, cos_before = dr.fma(2.0 * cos_phi, cos_m, -cos_before), cos_m
+    return total
+
+
+def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int, orders: int, channels: int) -> Any:
+    """G, table [visits, suns, m x channels]: ``moments`` [K, suns, l, m x channels] seen along each path, weighed by
+    ``weights`` [visits, l, m x channels] and summed over l."""
+    t, rows, width = types(), degree + 2, orders * channels
+    lane = dr.arange(t.UInt, len(paths.station) * suns)
+    sun, visit = lane % suns, lane // suns
+    node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun
+
+    def add(l_: Any, sums: list[Any], entries: int = width) -> tuple[Any, list[Any]]:
+        weight = row(weights, visit * rows + l_, entries, width)
+        value = row(moments, node * rows + l_, entries, width)
+        return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums[:entries], strict=True)] + sums[entries:]
+
+    sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+    if rows <= FEW_ROWS:
+        for l_ in range(rows):
+            # Degree l has l + 1 harmonics; the irradiance comes last, in the first place.
+            _, sums = add(l_, sums, channels if l_ == rows - 1 else min(l_ + 1, orders) * channels)
+    else:
+        end = dr.opaque(t.UInt, rows, 1)
+        _, sums = dr.while_loop((t.UInt(0), sums), lambda i, _: i < end, add, max_iterations=-1, label="contract")
+    return table_of(sums, lane)
+
+
+def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, degree: int, orders: int) -> Any:
+    """What a moment counts at each visit, table [visits, l, m x channels]: harmonic times weight times phase moment;
+    after the last l the ground's part of the irradiance (None: left out)."""
+    t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
+    rows = degree + 2
+
+    def harmonics() -> Any:
+        values = legendre(degree, paths.mu[paths.station])
+        out = np.zeros((len(values), rows, orders))
+        for place, (l_, m) in enumerate(zip(*pairs(degree), strict=True)):
+            if m < orders:
+                out[:, l_, m] = values[:, place]
+        return table(out)
+
+    basis = paths.kept(("harmonics", degree, orders), harmonics)
+    chi = optics.phase_moments(degree + 1)
+    lane = dr.arange(t.UInt, len(paths.station) * rows)
+    l_, visit = lane % rows, lane // rows
+    products = [0.0] * channels
+    if kinds:
+        weight, moment = row(scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
         for n in range(kinds):
-            moment = packet(chi, l_ * kinds + n, size)
-            for c in range(channels):
-                products[c] = dr.fma(
-                    dr.gather(t.Float, self._weights.weights[n * channels + c], visit), moment[c], products[c]
-                )
-        weights = stored(products, lane, size)
-
-        basis = self.samples.basis(degree)
-        # Suns vary fastest: eight neighbouring lanes share path and m, and run equally long loops.
-        lane = dr.arange(t.UInt, visits * orders * suns)
-        sun, rest = lane % suns, lane // suns
-        m, visit = rest % orders, rest // orders
-        node = dr.gather(t.UInt, device.level, visit) * suns + sun
-        first = m * (2 * degree + 3 - m) // 2 - m  # place of (l, m) is first + l
-
-        def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            value = dr.gather(t.Float, basis, visit * pair_total + first + l_)
-            weight = packet(weights, visit * orders + l_, size)
-            moment = packet(moments, node * pair_total + first + l_, size)
-            return l_ + 1, [dr.fma(value * weight[c], moment[c], sums[c]) for c in range(channels)]
-
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
-        end = dr.opaque(t.UInt, orders, 1)
-        _, sums = dr.while_loop((m + 0, zero), lambda l_, _: l_ < end, add, label="contract")
-        # The ground scatters into every direction alike: it joins m = 0 at the visit where a path ends on it.
-        light = packet(sky, sun, size, m == 0)
-        reflected = [dr.gather(t.Float, b, visit, m == 0) for b in self._weights.reflected]
-        sums = [dr.fma(a, b, c) for a, b, c in zip(reflected, light, sums, strict=False)]
-        table = dr.zeros(t.Float, visits * (suns + 2) * orders * size)
-        scatter_packet(table, sums, (visit * (suns + 2) + sun + 1) * orders + m, size)
-        dr.eval(table)
-        lane = dr.arange(t.UInt, visits * orders)
-        m, start = lane % orders, lane // orders * (suns + 2)
-        mirrored = packet(table, (start + 2) * orders + m, size)
-        last, before = (
-            packet(table, (start + suns) * orders + m, size),
-            packet(table, (start + suns - 1) * orders + m, size),
-        )
-        sign = dr.select(m % 2 == 1, -1.0, 1.0)
-        scatter_packet(table, [sign * v for v in mirrored], start * orders + m, size)
-        scatter_packet(
-            table, [2.0 * a - b for a, b in zip(last, before, strict=True)], (start + suns + 1) * orders + m, size
-        )
-        dr.eval(table)
-        return table
-
-
-def _cubic(f: Any) -> list[Any]:
-    """Catmull-Rom weights of the four nodes about a fraction ``f`` of the middle interval."""
-    g = 1.0 - f
-    return [
-        -0.5 * f * g * g,
-        dr.fma(f * f, dr.fma(1.5, f, -2.5), 1.0),
-        dr.fma(g * g, dr.fma(1.5, g, -2.5), 1.0),
-        -0.5 * g * f * f,
-    ]
+            products = [
+                dr.fma(weight[n * channels + c], moment[n * channels + c], products[c]) for c in range(channels)
+            ]
+    values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
+    if reflected is not None:
+        last = l_ == rows - 1
+        ground = row(reflected, visit, channels, active=last)
+        values[:channels] = [dr.select(last, r, v) for r, v in zip(ground, values, strict=False)]
+    return table_of(values, lane)

@@ -2,56 +2,76 @@
 needs them.
 
 Altitude nodes are uniform in a coordinate u(h) that grows with the scattering matter passed, flattened so that the
-thin upper air gets its share; fields are interpolated linearly in u. Sun nodes are uniform in x(theta), dense around
-the twilight.
+thin upper air gets its share. Sun nodes are uniform in x(theta), dense around the twilight.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
-from .atmosphere import Atmosphere
-from .backend import floats, parameter, types
-from .resolution import Resolution
+from .atmosphere import Atmosphere, Constituent
+from .backend import Keeper, floats, parameter, types
+from .profile import Tabulated
+from .resolution import Resolution, column_of
 
 _FINE = 2048
+REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 
 
-class Grid:
+class Grid(Keeper):
     """Altitude nodes ``h`` [K] (m) and sun nodes ``theta`` [S] (radians) of an atmosphere, and the maps onto them.
 
-    The field is solved at K altitudes and S suns, and interpolated, cubically, to the refined ``levels`` and
-    ``sources`` suns, on which light is then looked up linearly. Order 1, which knows the sun's disc, is solved at
-    ``first_theta``, several times as many suns.
+    Orders >= 2 are solved at ``theta``; order 1, which knows the edge of the shadow, at ``first_theta``, several times
+    as many suns. Between nodes light is interpolated cubically; ``sources`` and ``level_count`` are refined suns and
+    altitudes on which the result is tabulated, so that it can be looked up linearly. ``suns``: the range of sun zenith
+    angles (radians, at the observer) that is wanted; the nodes then are those of the full grid that can matter for it.
     """
 
-    _known: ClassVar[OrderedDict[str, Grid]] = OrderedDict()
+    _known: ClassVar[OrderedDict[Any, Grid]] = OrderedDict()
 
     @classmethod
-    def of(cls, atmosphere: Atmosphere, resolution: Resolution) -> Grid:
-        """The grid for an atmosphere; the same object for atmospheres of the same shape, so that what is built on it
-        is kept."""
-        grid = cls(atmosphere, resolution)
-        key = f"{resolution} {grid.radius_m} {grid.levels.tobytes().hex()} {grid.theta.tobytes().hex()}"
-        known = cls._known.setdefault(key, grid)
+    def of(cls, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None) -> Grid:
+        """The grid for an atmosphere; the same object for atmospheres with the same profiles and roughly the same
+        optical depths, so that what is built on it is kept."""
+        key = (
+            types().__name__,
+            resolution,
+            suns,
+            atmosphere.bottom_radius_m,
+            atmosphere.thickness_m,
+            atmosphere.sun_angular_radius_deg,
+            *((_profile_key(c.profile), *_matter(atmosphere, c)) for c in atmosphere.constituents),
+        )
+        if key not in cls._known:
+            cls._known[key] = cls(atmosphere, resolution, suns)
         cls._known.move_to_end(key)
         while len(cls._known) > REMEMBERED:
             cls._known.popitem(last=False)
-        return known
+        return cls._known[key]
 
-    def __init__(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
+    def __init__(
+        self, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None
+    ) -> None:
         self.resolution = resolution
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
-        self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine[0])
-        self._place_suns(resolution.suns, resolution.refine[1], resolution.first_suns)
+        self._kept: dict[Any, Any] = {}
+        self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine)
+        self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
+
+    def arrays(self) -> list[Any]:
+        """Every Dr.Jit array that is kept, once."""
+        found: dict[int, Any] = {}
+        _collect(vars(self), found, set())
+        return list(found.values())
 
     def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
         # Samples dense near the ground, so that a thin layer there is resolved too.
@@ -59,19 +79,33 @@ class Grid:
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
         rise = 0.3 * step / atmosphere.thickness_m
         depth = 0.0 * step
+        self._bounds = []
         for c in atmosphere.constituents:
             density = np.maximum(np.asarray(c.profile.density(middle)), 0.0)
-            depth = depth + _rounded_depth(np.max(c.extinction_per_m) * density * step)
+            scatters, rounded = _matter(atmosphere, c)
+            column = density @ step
+            # A small change of the coefficients moves no node. A depth that rounds to 2^n is at most 2^(n + 1/2).
+            if column > 0.0:
+                depth = depth + (2.0**rounded / column * density * step if rounded > -2 else 0.0)
+                self._bounds.append((c.profile, 2.0 ** (rounded + 0.5) / column))
             share = density ** (1.0 / 3.0) * step
-            if np.any(c.scattering_per_m > 0) and share.sum() > 0:
+            if scatters and share.sum() > 0:
                 rise = rise + share / share.sum()
         # Light in a thick layer changes within a free path of its top and bottom, slowly between.
         below = np.cumsum(depth) - 0.5 * depth
         rise = rise + depth / (1.0 + below) + depth / (1.0 + depth.sum() - below)
         u = np.concatenate([[0.0], np.cumsum(rise)])
-        self._u, self._h_of_u, self.refine = u * ((count - 1) / u[-1]), h, refine
-        self.h, self.levels = self.levels_at(1), self.levels_at(refine)
-        self.altitude_refinement = _cubic_refinement(count, refine, mirrored=None)
+        self._u, self._h_of_u = u * ((count - 1) / u[-1]), h
+        self.h = self.levels_at(1)
+        self.refine, self.level_count = refine, refine * (count - 1) + 1
+
+    def extinction_bound(self, h: np.ndarray) -> np.ndarray:
+        """Extinction coefficient (1/m) at altitudes ``h`` of the most opaque atmosphere that shares this grid; at most
+        twice that of the others where they are not thin."""
+        total = np.zeros(np.shape(h))
+        for profile, per_density in self._bounds:
+            total = total + per_density * np.maximum(np.asarray(profile.density(h)), 0.0)
+        return total
 
     def levels_at(self, refine: int) -> np.ndarray:
         """Altitudes (m) at ``refine`` equal steps of u per interval of the solved ones, ascending from 0 to the top."""
@@ -80,7 +114,7 @@ class Grid:
         levels[0], levels[-1] = 0.0, self.thickness_m
         return levels
 
-    def _place_suns(self, count: int, refine: int, first: int) -> None:
+    def _place_suns(self, count: int, refine: int, first: int, suns: tuple[float, float] | None) -> None:
         # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for
         # multiple.
         dip = np.arccos(self.radius_m / (self.radius_m + self.thickness_m))
@@ -88,20 +122,21 @@ class Grid:
         self._center, self._width = 0.5 * np.pi + 0.3 * dip, 0.8 * dip
         theta = np.linspace(0.0, end, 4 * _FINE)
         self._scale = 1.0
-        fine = refine * (count - 1)
-        self._scale = fine / self._sun_coordinate(end)
-        self.sources = fine + 1  # refined suns
+        self._scale = (count - 1) / self._sun_coordinate(end)
+        position = self._sun_coordinate(theta)
+        low, high = 0, count - 1
+        if suns is not None:
+            # Light comes from where the sun stands higher or lower by the turn along a path, once per order.
+            reach = np.clip([suns[0] - REACH * dip, suns[1] + REACH * dip], 0.0, end)
+            low, high = np.interp(reach, theta, position)
+            low = max(0, min(int(np.floor(low)), count - 4))
+            high = min(count - 1, max(int(np.ceil(high)), low + 3))
+        self.sun_offset, nodes = float(low), high - low
+        self.whole_suns = low == 0
         self.theta, self.first_theta = (
-            np.interp(np.linspace(0.0, fine, n), self._sun_coordinate(theta), theta)
-            for n in (count, first * (count - 1) + 1)
+            np.interp(low + np.arange(n * nodes + 1) / n, position, theta) for n in (1, first)
         )
-        self.sun_refine = refine
-        self.sun_refinement, self.first_sun_refinement = (
-            np.stack(
-                [_cubic_refinement(first * (count - 1) + 1, refine // first, mirrored=sign) for sign in (1.0, -1.0)]
-            )
-            for first in (1, first)
-        )
+        self.first, self.sun_refine, self.sources = first, refine, refine * nodes + 1
 
     def _sun_coordinate(self, theta: np.ndarray | float) -> np.ndarray:
         bend = np.arctan((theta - self._center) / self._width) + np.arctan(self._center / self._width)
@@ -123,68 +158,73 @@ class Grid:
     def _u_buffer(self) -> Any:
         return floats(self._u)
 
-    def locate_altitude(self, h: Any, refine: int | None = None) -> tuple[Any, Any]:
-        """Index of the refined level below altitude ``h`` and the fraction of the way to the next."""
+    def locate_altitude(self, h: Any) -> tuple[Any, Any]:
+        """Index of the level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
-        refine = self.refine if refine is None else refine
         position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return _split(
-            parameter(float(refine)) * dr.lerp(u0, u1, position - t.Float(cell)), refine * (self.shape[0] - 1) + 1
-        )
+        return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self.level_count)
+
+    @cached_property
+    def _sun_map(self) -> list[Any]:
+        return [parameter(v) for v in (self._center, self._width, self._scale, self.sun_offset, self.shape[1] - 1.0)]
 
     def sun_position(self, mu_s: Any) -> Any:
-        """Sun coordinate x of cos(sun zenith) ``mu_s``, in units of the refined nodes, clipped to the last."""
-        center, width, scale = (parameter(v) for v in (self._center, self._width, self._scale))
+        """Sun coordinate of cos(sun zenith) ``mu_s``: s at node s, clipped to the first and the last."""
+        center, width, scale, offset, last = self._sun_map
         theta = dr.acos(mu_s)
         bend = dr.atan((theta - center) / width) + dr.atan(center / width)
-        return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta), 0.0, self.sources - 1.0)
+        return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta) - offset, 0.0, last)
 
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
-        """Index of the refined sun node before ``mu_s`` and the fraction of the way to the next."""
-        return _split(self.sun_position(mu_s), self.sources)
+        """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
+        return split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
 
 
-def _rounded_depth(steps: np.ndarray) -> np.ndarray:
-    """Optical depths of thin layers, scaled to a total that is a power of two, 0 below 1/4: a small change moves no
-    node."""
-    total = steps.sum()
-    return steps * (2.0 ** np.round(np.log2(total)) / total) if total > 0.25 else 0.0 * steps
+def _collect(value: Any, found: dict[int, Any], seen: set[int]) -> None:
+    """Put the Dr.Jit arrays within containers and objects of this package into ``found``."""
+    if dr.is_array_v(value):
+        found.setdefault(value.index, value)
+    elif id(value) not in seen:
+        seen.add(id(value))
+        if isinstance(value, dict):
+            parts = list(value.values())
+        elif isinstance(value, (list, tuple)):
+            parts = value
+        else:
+            ours = isinstance(value, SimpleNamespace) or type(value).__module__.startswith(__package__)
+            parts = list(vars(value).values()) if ours and hasattr(value, "__dict__") else []
+        for part in parts:
+            _collect(part, found, seen)
 
 
-def _split(position: Any, count: int) -> tuple[Any, Any]:
+def _matter(atmosphere: Atmosphere, constituent: Constituent) -> tuple[bool, int]:
+    """Whether a constituent scatters, and its optical depth as a power of two, at least -2: differences that move
+    nodes."""
+    depth = float(np.max(constituent.extinction_per_m)) * column_of(atmosphere, constituent)
+    return bool(np.any(constituent.scattering_per_m > 0)), max(-2, round(np.log2(max(depth, 1e-9))))
+
+
+def _profile_key(profile: Any) -> Any:
+    if isinstance(profile, Tabulated):
+        return profile.altitude_m.tobytes(), profile.values.tobytes()
+    return profile
+
+
+def split(position: Any, count: int) -> tuple[Any, Any]:
+    """Index of the node before a position, and the fraction of the way to the next."""
     t = types()
     index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), dr.opaque(t.UInt, count - 2, 1))
     return index, position - t.Float(index)
 
 
-def _cubic_refinement(count: int, refine: int, *, mirrored: float | None) -> np.ndarray:
-    """Matrix [refine (count - 1) + 1, count]: Catmull-Rom interpolation of equidistant values at ``refine`` points
-    per interval.
-
-    ``mirrored``: 1 or -1 for a function even or odd about its first node (a moment cos(m phi) is (-1)^m: the sun
-    passes through the zenith); other ends go straight on.
-    """
-    matrix = np.zeros((refine * (count - 1) + 1, count))
-    for row in range(len(matrix)):
-        cell = min(row // refine, count - 2)
-        f = row / refine - cell
-        weights = (
-            -0.5 * f + f**2 - 0.5 * f**3,
-            1.0 - 2.5 * f**2 + 1.5 * f**3,
-            0.5 * f + 2.0 * f**2 - 1.5 * f**3,
-            -0.5 * f**2 + 0.5 * f**3,
-        )
-        for place, weight in enumerate(weights, cell - 1):
-            if place < 0 and mirrored is not None:
-                matrix[row, -place] += mirrored * weight
-            elif place < 0:
-                matrix[row, 0] += 2.0 * weight
-                matrix[row, 1] -= weight
-            elif place >= count:
-                matrix[row, count - 1] += 2.0 * weight
-                matrix[row, count - 2] -= weight
-            else:
-                matrix[row, place] += weight
-    return matrix
+def cubic(f: Any) -> list[Any]:
+    """Catmull-Rom weights of the four nodes about a fraction ``f`` of the middle interval."""
+    g = 1.0 - f
+    return [
+        -0.5 * f * g * g,
+        dr.fma(f * f, dr.fma(1.5, f, -2.5), 1.0),
+        dr.fma(g * g, dr.fma(1.5, g, -2.5), 1.0),
+        -0.5 * g * f * f,
+    ]

@@ -11,9 +11,15 @@ from functools import lru_cache
 import numpy as np
 
 
-def pair_count(degree: int) -> int:
-    """Number of pairs (l, m) with 0 <= m <= l <= degree."""
-    return (degree + 1) * (degree + 2) // 2
+def pair_count(degree: int, most: int | None = None) -> int:
+    """Number of pairs (l, m) with 0 <= m <= l <= degree, and m <= ``most``: they come first."""
+    most = degree if most is None else most
+    return (most + 1) * (2 * degree + 2 - most) // 2
+
+
+def pair_index(degree: int, l_: int, m: int) -> int:
+    """Place of the pair (l, m) among those up to ``degree``."""
+    return m * (2 * degree + 3 - m) // 2 + l_ - m
 
 
 @lru_cache(maxsize=64)

@@ -7,21 +7,27 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from .backend import floats, types
 from .column import SunColumns
 from .field import Field
 from .gather import Gather
 from .grid import Grid
 from .optics import Optics
 from .paths import directions_at
-from .projection import projection
-from .refinement import Order, Refinement, combined
+from .projection import Moments, Projection
+from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
+from .total import total_of
+
+AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
 
 def solve(
@@ -33,48 +39,175 @@ def solve(
     ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
     soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
     """
-    r, channels = resolution, optics.channel_count
-    fine = directions_at(grid, r.first_up, r.first_down)
-    suns = len(grid.first_theta)
-    project = projection(grid, suns, fine, r.first_azimuths, r.first_degree, channels)
-    moments, sky = project(first_order(optics, columns, grid, fine, r))
-    zeroth = Order(moments, sky, r.first_degree, project.size).zeroth()
-    refine = Refinement(grid, zeroth.numpy().reshape(-1, suns, project.size))
-    first = _relative(refine.first_inverse, moments, sky, r.first_degree, project.size)
-    if orders == 1:
-        return Field(optics, columns, grid, refine, first, None, None, scatters=False)
-    gather = Gather(optics, grid, directions_at(grid, r.up, r.down), r.azimuths)
-    project = projection(grid, grid.shape[1], gather.directions, r.azimuths, r.degree, channels)
-    light, later, held = refine.thinned(first), [], []
-    for _ in range(2, (orders or r.orders) + 1):
-        light = _relative(refine.inverse, *project(gather(refine, light)), r.degree, project.size)
-        later.append(light)
-        if orders is None and len(later) >= 3:
-            held += [order.numpy(grid) for order in later[len(held) :]]
-            weights, error = _extrapolated(np.array(held))
-            if error < 0.1 * tolerance:
+    steps = _Steps.of(optics, columns, grid, resolution)
+    most = orders or resolution.orders
+    values = optics.values(resolution.degrees, resolution.phase_degree)
+    done = steps.start(values, min(AT_ONCE, most))
+    later, probes = done["later"], [p.numpy() for p in done["probes"]]
+    weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
+    for n in range(AT_ONCE, most + 1):
+        if orders is None and later:
+            shape = (len(probes), grid.shape[0], grid.shape[1], 2, optics.channel_count)
+            weights, error = _extrapolated(np.reshape(probes, shape))
+            arriving = weights
+            if error < resolution.converged * tolerance:
                 break
-    if orders is None:
-        rest = combined(later, weights)
-        return Field(optics, columns, grid, refine, first, rest, rest.sky)
-    ones = np.ones((len(later), grid.shape[1], project.size))
-    last = combined(later, ones)
-    ones[-1] = 0.0
-    return Field(optics, columns, grid, refine, first, combined(later, ones), last.sky)
+        if n == most:
+            break
+        light, probe = steps.step(values, done, later[-1], n + 1)
+        later.append(light)
+        probes.append(probe.numpy())
+    if orders is not None and later:
+        arriving = np.ones((len(later), grid.shape[1], optics.channel_count))
+        weights = arriving.copy()
+        weights[-1] = 0.0
+    shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
+    moments, sky, reflected = steps.finish(values, done, later, shares)
+    if orders == 1:
+        reflected = 0.0 * reflected  # the reflection would be the second event
+    reference = Reference.of(grid, optics.channel_count, done["reference"])
+    degree, again = resolution.first_degree, orders != 1
+    return Field(optics, columns, grid, reference, degree, moments, sky, reflected, scatters=again)
 
 
-def _relative(inverse: Any, moments: Any, sky: Any, degree: int, size: int) -> Order:
-    """An order over the reference, whose inverse is given at the order's nodes."""
-    lane = dr.arange(dr.uint32_array_t(type(moments)), dr.width(moments))
-    per_node = dr.width(moments) // dr.width(sky)
-    moments = moments * dr.gather(type(inverse), inverse, lane // (per_node * size) * size + lane % size)
-    sky = sky * inverse
-    dr.eval(moments, sky)
-    return Order(moments, sky, degree, size)
+class _Steps:
+    """The parts of a solve as functions of an atmosphere's values alone.
+
+    Everything else is geometry that stays with the grid. A solve is a hundred small kernels, and tracing them costs
+    more than running them; so from the second solve on a grid on they are recorded (dr.freeze) and played back. Not
+    so where derivatives are wanted: they do not pass through a recording.
+    """
+
+    def __init__(self, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> None:
+        self._optics, self._columns, self._grid, self._resolution = optics, columns, grid, resolution
+        self._stages = [directions_at(grid, s.up, s.down) for s in resolution.stages]
+        self._recorded: dict[Any, Callable[..., Any]] = {}
+        self._used: set[Any] = set()
+
+    @classmethod
+    def of(cls, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> _Steps:
+        """Those kept with the grid for atmospheres of this make-up, unless the profiles carry derivatives."""
+        if optics.profiles_differentiable:
+            return cls(optics, columns, grid, resolution)
+        return grid.kept(("steps", optics.make_up), lambda: cls(optics, columns, grid, resolution))
+
+    def start(self, values: Any, count: int) -> dict[str, Any]:
+        """Orders 1 to ``count``, the reference, and what the next order needs."""
+        return self._run(("start", count), lambda v: self._start(v, count), values)
+
+    def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> tuple[Any, Any]:
+        """Order ``n`` from the one before, and its probe."""
+        stage, before = self._stage(n), self._stage(n - 1)
+        if stage != before or n == 2:
+            done["gather"] = None
+        key = ("step", stage, before, n == 2, done["gather"] is None)
+        light, probe, done["gather"] = self._run(
+            key,
+            lambda v, reference, gather, light: self._step(v, reference, gather, light, n),
+            values,
+            done["reference"],
+            done["gather"],
+            light,
+        )
+        return light, probe
+
+    def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
+        """What Field holds: moments, sky and reflected irradiance."""
+        return self._run(
+            ("finish", len(later)),
+            lambda v, reference, first, later, shares: self._finish(v, reference, first, later, shares),
+            values,
+            done["reference"],
+            done["first"],
+            later,
+            shares,
+        )
+
+    def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        if self._optics.profiles_differentiable or dr.grad_enabled(arguments):
+            return function(*arguments)
+        if key not in self._used:
+            self._used.add(key)
+            return function(*arguments)
+        if key not in self._recorded:
+            arrays = self._grid.arrays()
+            self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
+        # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
+        # collector has to wait.
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return self._recorded[key](*arguments)
+        finally:
+            if collects:
+                gc.enable()
+
+    def _stage(self, n: int) -> int:
+        return min(n - 2, len(self._stages) - 1)
+
+    def _degree(self, n: int) -> tuple[int, int]:
+        """Highest l and m of an order."""
+        r = self._resolution
+        return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
+
+    def _start(self, values: Any, count: int) -> dict[str, Any]:
+        optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
+        suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
+        project = Projection.at(grid, fine, *self._degree(1))
+        first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
+        reference = Reference.above(grid, first)
+        later, probes, light, gather = [], [], first, None
+        for n in range(2, count + 1):
+            if n > 2 and self._stage(n) != self._stage(n - 1):
+                gather = None
+            gather = gather or self._gather(optics, reference, n, None)
+            light = self._next(gather, light, n)
+            later.append(light.values)
+            probes.append(_probe(light, grid, reference))
+        held = gather and gather.held
+        return {"first": first.values, "reference": reference.held, "later": later, "probes": probes, "gather": held}
+
+    def _step(self, values: Any, reference: Any, gather: Any, light: Any, n: int) -> tuple[Any, Any, Any]:
+        optics, grid = self._optics.with_values(values), self._grid
+        reference = Reference.of(grid, optics.channel_count, reference)
+        suns = len(grid.first_theta) if n == 2 else grid.shape[1]
+        gather = self._gather(optics, reference, n, gather)
+        light = self._next(gather, Moments(light, *self._degree(n - 1), suns, optics.channel_count), n)
+        return light.values, _probe(light, grid, reference), gather.held
+
+    def _gather(self, optics: Optics, reference: Reference, n: int, held: Any) -> Gather:
+        stage, r = self._stage(n), self._resolution
+        s = r.stages[stage]
+        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.most, r.nodes, held)
+
+    def _next(self, gather: Gather, light: Moments, n: int) -> Moments:
+        project = Projection.at(self._grid, self._stages[self._stage(n)], *self._degree(n))
+        return project(gather(light), self._grid.shape[1], light.channels)
+
+    def _finish(self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
+        optics, grid = self._optics.with_values(values), self._grid
+        channels = optics.channel_count
+        reference = Reference.of(grid, channels, reference)
+        first = Moments(first, *self._degree(1), len(grid.first_theta), channels)
+        rest = [Moments(v, *self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
+        return total_of(optics, self._columns, grid, reference, first, rest, shares)
+
+
+def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:
+    """The moments of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
+    t, (altitudes, suns), channels = types(), grid.shape, order.channels
+    lane = dr.arange(t.UInt, altitudes * suns * 2 * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % 2, place // 2
+    sun, k = node % suns, node // suns
+    values = dr.gather(t.Float, dr.detach(order.values), order.index(k, entry, sun, channel))
+    values = values * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+    dr.eval(values)
+    return values
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights [N, S, size] of the N orders [N, K, S, pairs, size] whose sum is closest to that of all orders, and its
+    """Weights [N, S, size] of the N orders [N, K, S, moments, size] whose sum is closest to that of all orders, and its
     error.
 
     Reduced-rank extrapolation (Eddy 1979; Sidi 1991), per sun and channel: among the combinations sum_j gamma_j x_j,
@@ -84,18 +217,21 @@ def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
     largest over suns and channels that have light.
     """
     count, _, suns, _, size = orders.shape
-    u = np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1).astype(np.float64)
-    gram = u @ np.swapaxes(u, -1, -2)
-    scale = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
+    u = np.ascontiguousarray(np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1), dtype=np.float64)
+    products = u @ np.swapaxes(u, -1, -2)
+    scale = np.trace(products, axis1=-2, axis2=-1)[..., None, None]
     dark = scale <= 0.0
     # A gram matrix of float32 data knows nothing below 1e-10 of its trace.
-    gram = np.where(dark, np.eye(count), gram / np.where(dark, 1.0, scale) + 1e-10 * np.eye(count))
+    gram = np.where(dark, np.eye(count), products / np.where(dark, 1.0, scale) + 1e-10 * np.eye(count))
     gamma = np.linalg.solve(gram, np.ones((suns, size, count, 1)))[..., 0]
     gamma = gamma / gamma.sum(axis=-1, keepdims=True)
     # x_j holds the orders before the j-th, so an order counts in every later partial sum.
     weights = 1.0 - np.cumsum(gamma, axis=-1)
-    residual = np.linalg.norm(np.einsum("scn,scnv->scv", gamma, u), axis=-1)
-    whole = np.linalg.norm(np.einsum("scn,scnv->scv", weights, u), axis=-1) + np.linalg.norm(u[:, :, 0], axis=-1)
+
+    def norm(combination: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", combination, products, combination), 0.0))
+
+    residual, whole = norm(gamma), norm(weights) + np.sqrt(products[..., 0, 0])
     weights = weights + gamma  # the residual is the next term of the sum: take it too
     error = np.divide(residual, whole, out=np.zeros_like(residual), where=whole > 0.0)
     return np.moveaxis(weights, -1, 0), float(error.max())

@@ -6,22 +6,25 @@ are opaque to the compiler, so that another atmosphere of the same make-up reuse
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
-from .backend import channels, floats, parameter
+from .backend import channels, parameter, table
 from .profile import Exponential, Tabulated, Tent
+from .resolution import moments_of
 
 FEW_CORNERS = 8
 PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 # Scale heights at which rays are cut: the field is asked once between two cuts.
 LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)
+_VALUES = ("radius", "thickness", "sun_radius", "solar", "albedo", "scattering", "extinction")
 
 
 class Optics:
@@ -46,8 +49,29 @@ class Optics:
         self.scatterers = [
             k for k, c in enumerate(self.constituents) if c.phase is not None and np.any(c.scattering_per_m > 0)
         ]
+        self.phase_tables: dict[int, Any] = {}
+        self.moment_tables: dict[int, Any] = {}
         self._profiles = [_with_parameters(c.profile) for c in self.constituents]
         self._phases = [_phases(c, indices) for c in self.constituents]
+
+    @cached_property
+    def make_up(self) -> tuple[Any, ...]:
+        """What kernels depend on beside values: how many channels and which constituents scatter."""
+        return self.channel_count, tuple(self.scatterers), len(self.constituents)
+
+    def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
+        """Everything that a solve reads of an atmosphere beside its profiles, with phase moments up to ``degrees``."""
+        return {
+            **{name: getattr(self, name) for name in _VALUES},
+            "phase_tables": {phase_degree: self.phase_table(phase_degree)},
+            "moment_tables": {degree: self.phase_moments(degree) for degree in degrees},
+        }
+
+    def with_values(self, values: dict[str, Any]) -> Optics:
+        """These optics with other ``values``."""
+        other = copy(self)
+        vars(other).update(values)
+        return other
 
     def densities(self, h: Any) -> list[Any]:
         """Relative density of every constituent at altitude ``h`` (m)."""
@@ -83,30 +107,32 @@ class Optics:
         values = {id(p): p.value(nu) for p in phases}
         return [values[id(p)] for p in phases]
 
-    def phase_table(self, degree: int, size: int) -> Any:
-        """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: [node,
-        scatterer, size]."""
-        nu = np.linspace(-1.0, 1.0, PHASE_NODES)
+    def phase_table(self, degree: int) -> Any:
+        """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: table [node,
+        scatterer x channel]."""
+        if degree in self.phase_tables:
+            return self.phase_tables[degree]
         weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
-        table = np.zeros((PHASE_NODES, len(self.scatterers), size))
-        for n, k in enumerate(self.scatterers):
-            for c, moments in enumerate(self._moments(k, degree)):
-                table[:, n, c] = np.polynomial.legendre.legval(nu, weights * moments)
-        return floats(table)
+        chi = self._scatterers_moments(degree)
+        return table(_legendre_values(degree) @ (weights[:, None] * chi))
 
-    def phase_moments(self, degree: int, size: int) -> Any:
-        """Legendre moments chi_l of the scatterers: one buffer [l, scatterer, size]."""
-        table = np.zeros((degree + 1, max(len(self.scatterers), 1), size))
-        for n, k in enumerate(self.scatterers):
-            for c, moments in enumerate(self._moments(k, degree)):
-                table[:, n, c] = moments
-        return floats(table)
+    def phase_moments(self, degree: int) -> Any:
+        """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
+        return self.moment_tables[degree] if degree in self.moment_tables else table(self._scatterers_moments(degree))
+
+    def _scatterers_moments(self, degree: int) -> np.ndarray:
+        columns = [m for k in self.scatterers for m in self._moments(k, degree)]
+        return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
 
     def _moments(self, constituent: int, degree: int) -> list[np.ndarray]:
         phase = self.constituents[constituent].phase
-        phases = [phase.at(int(i)) for i in self.indices]
-        made = {id(p): p.moments(degree) for p in phases}
-        return [made[id(p)] for p in phases]
+        return [moments_of(phase.at(int(i)), degree) for i in self.indices]
+
+    @cached_property
+    def profiles_differentiable(self) -> bool:
+        """Whether a density profile carries derivatives: then nothing that depends on it can be kept."""
+        values = [getattr(p, f.name) for p in self._profiles if not isinstance(p, Tabulated) for f in fields(p)]
+        return any(dr.grad_enabled(value) for value in values)
 
     @cached_property
     def breaks_m(self) -> np.ndarray:
@@ -145,6 +171,12 @@ class Optics:
             if isinstance(profile, Tabulated):
                 kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
         return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
+
+
+@lru_cache(maxsize=16)
+def _legendre_values(degree: int) -> np.ndarray:
+    """P_l at PHASE_NODES cosines from -1 to 1, [node, l]."""
+    return np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, PHASE_NODES), degree)
 
 
 def _maximum(values: list[Any]) -> Any:

@@ -3,105 +3,117 @@ atmosphere."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from .backend import types
-from .geometry import altitude_along
-from .march import FEW, MAX_DEPTH, SPENT_DEPTH
+from .backend import row, table_of, types
 from .optics import Optics
-from .paths import Paths
-from .quadrature import gauss_legendre, running_integral
+from .paths import Paths, Points, points_along
+
+
+@dataclass
+class Columns:
+    """Matter along paths: no coefficient and no wavelength enters, so it serves every atmosphere with these profiles.
+
+    ``density`` (relative) and ``column`` (m, from the path's start) at the points, tables [points, constituents];
+    ``whole``: column of the whole path [rays, constituents].
+    """
+
+    density: Any
+    column: Any
+    whole: Any
+
+
+def columns_along(optics: Optics, points: Points) -> Columns:
+    """Densities and columns at the points of the paths, kept with them unless the profiles carry derivatives."""
+    if optics.profiles_differentiable:
+        return _columns_along(optics, points)
+    return points.paths.kept(("columns", points.nodes), lambda: _columns_along(optics, points))
+
+
+def _columns_along(optics: Optics, points: Points) -> Columns:
+    t, d, nodes = types(), points.device, points.nodes
+    kinds = len(optics.constituents)
+    count = len(points.h)
+    if not kinds or not count:
+        empty = dr.zeros(t.Float, 8)
+        return Columns(empty, empty, empty)
+    lane = dr.arange(t.UInt, count)
+    density = table_of(optics.densities(d.h), lane)
+    part = dr.arange(t.UInt, count // nodes)
+    own = [dr.zeros(t.Float, count // nodes) for _ in range(kinds)]
+    for g in range(nodes):
+        weight = dr.gather(t.Float, d.weight, part * nodes + g)
+        own = [dr.fma(weight, v, s) for v, s in zip(row(density, part * nodes + g, kinds), own, strict=True)]
+    own = table_of(own, part)
+
+    def before(start: Any, stop: Any) -> list[Any]:
+        def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            return i + 1, [s + v for s, v in zip(sums, row(own, i, kinds), strict=True)]
+
+        zero = [dr.zeros(t.Float, dr.width(stop)) for _ in range(kinds)]
+        return dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="columns")[1]
+
+    part = lane // nodes
+    passed = before(dr.gather(t.UInt, d.first, part), part)
+    running = row(d.running, lane % nodes, nodes)
+    for g, inside in enumerate(running):
+        inside = inside * d.length
+        passed = [dr.fma(inside, v, s) for v, s in zip(row(density, part * nodes + g, kinds), passed, strict=True)]
+    ray = dr.arange(t.UInt, len(points.paths.h))
+    start, stop = (dr.gather(t.UInt, d.ray_parts, 2 * ray + i) for i in (0, 1))
+    return Columns(density, table_of(passed, lane), table_of(before(start, stop), ray))
 
 
 class PathWeights:
     """What every visit of a path contributes to the light at its origin, for one atmosphere; no sun enters.
 
-    Between two stations the field is linear in the altitude coordinate u; each station gets its hat function's share
-    of the integral of density times transmittance over both pieces beside it.
+    Between two stations light is interpolated (paths.Points.shares); each station gets its share of the integral of
+    density times transmittance over the pieces about it.
 
-    ``weights[n * C + c]`` [visits]: scattering by scatterer n in channel c; ``reflected[c]`` [visits]: transmittance
-    times albedo / pi at the visit where a path ends on the ground, else 0.
+    ``scattered``: table [visits, scatterers x channels], scattering by each; ``reflected``: table [visits, channels],
+    transmittance times albedo / pi at the visit where a path ends on the ground, else 0.
     """
 
-    def __init__(self, optics: Optics, paths: Paths) -> None:
-        t, p, d = types(), paths, paths.device
+    def __init__(self, optics: Optics, paths: Paths, nodes: int) -> None:
+        t = types()
+        points = points_along(paths, nodes)
+        at, device, d = columns_along(optics, points), paths.device, points.device
         kinds, channels = len(optics.constituents), optics.channel_count
-        node = dr.arange(t.UInt, p.count)
-        ray, distance, u = d.ray, d.distance, d.u
-        h, mu = dr.gather(t.Float, d.h, ray), dr.gather(t.Float, d.mu_start, ray)
-        nxt = dr.minimum(node + 1, dr.opaque(t.UInt, p.count - 1, 1))
-        start, stop = distance, dr.select(d.follows == 1, dr.gather(t.Float, distance, nxt), distance)
-        u_start, u_stop = u, dr.gather(t.Float, u, nxt)
-        x, w = (a.tolist() for a in gauss_legendre(FEW))
-        running = running_integral(FEW, tuple(x)).tolist()
+        visit = dr.arange(t.UInt, len(paths.station))
+        station = device.station
+        sharing = points.shares.shape[1]
+        bounds = [dr.gather(t.UInt, d.bounds, station * (sharing + 1) + i) for i in range(sharing + 1)]
 
-        own = [dr.zeros(t.Float, p.count) for _ in range(kinds)]
-        for node_x, weight in zip(x, w, strict=True):
-            there, _ = altitude_along(optics.radius, h, mu, dr.fma(stop - start, node_x, start))
-            for k, density in enumerate(optics.densities(there)):
-                own[k] = dr.fma((stop - start) * weight, density, own[k])
-        first = dr.gather(t.UInt, d.first, ray)
-        dr.eval(own)
+        def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            # The farther along the path a point lies, the farther behind it this station is.
+            place = t.UInt(sharing - 1)
+            for bound in bounds[1:-1]:
+                place = dr.select(i >= bound, place - 1, place)
+            weight = dr.gather(t.Float, d.weight, i) * dr.gather(t.Float, d.shares, i * sharing + place)
+            density, column = row(at.density, i, kinds), row(at.column, i, kinds)
+            seen = [dr.exp(-depth) * weight for depth in optics.optical_depths(column)]
+            return i + 1, [
+                dr.fma(optics.scattering[k][c] * density[k], seen[c], sums[n * channels + c])
+                for n, k in enumerate(optics.scatterers)
+                for c in range(channels)
+            ]
 
-        def add_piece(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            return i + 1, [s + dr.gather(t.Float, o, i) for s, o in zip(sums, own, strict=True)]
-
-        zeros = [dr.zeros(t.Float, p.count) for _ in range(kinds)]
-        _, before = dr.while_loop((first + 0, zeros), lambda i, _: i < node, add_piece, label="columns")
-
-        def advance(at: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> tuple[Any, ...]:
-            here, _ = altitude_along(optics.radius, h, mu, at)
-            there, _ = altitude_along(optics.radius, h, mu, stop)
-            densest = dr.maximum(
-                optics.largest_extinction(optics.densities(here)), optics.largest_extinction(optics.densities(there))
-            )
-            length = dr.minimum(stop - at, MAX_DEPTH / dr.maximum(densest, 1e-30))
-            points = [altitude_along(optics.radius, h, mu, dr.fma(length, node_x, at))[0] for node_x in x]
-            density = [optics.densities(point) for point in points]
-            for g in range(FEW):
-                inside = [
-                    dr.fma(length, sum(running[g][i] * density[i][k] for i in range(FEW)), amounts[k])
-                    for k in range(kinds)
-                ]
-                seen = [dr.exp(-depth) * (length * w[g]) for depth in optics.optical_depths(inside)]
-                k_index, fraction = paths.locate(points[g])
-                position = t.Float(k_index) + fraction
-                hat = dr.clip((position - u_start) / (u_stop - u_start), 0.0, 1.0)
-                hat = dr.select(u_stop == u_start, 0.5, hat)
-                for n, k in enumerate(optics.scatterers):
-                    for c in range(channels):
-                        share = optics.scattering[k][c] * density[g][k] * seen[c]
-                        i = n * channels + c
-                        near[i] = dr.fma(share, 1.0 - hat, near[i])
-                        far[i] = dr.fma(share, hat, far[i])
-            for k in range(kinds):
-                amounts[k] = dr.fma(length, sum(w[g] * density[g][k] for g in range(FEW)), amounts[k])
-            done = length >= stop - at
-            return dr.select(done, stop, at + length), amounts, near, far
-
-        def unfinished(at: Any, amounts: list[Any], near: list[Any], far: list[Any]) -> Any:
-            depths = optics.optical_depths(amounts)
-            thinnest = depths[0]
-            for depth in depths[1:]:
-                thinnest = dr.minimum(thinnest, depth)
-            return (at < stop) & (thinnest < SPENT_DEPTH)
-
-        many = len(optics.scatterers) * channels
-        state = (
-            start + 0.0,
-            [b + 0.0 for b in before],
-            *([dr.zeros(t.Float, p.count) for _ in range(many)] for _ in range(2)),
+        sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
+        self.scattered = dr.zeros(t.Float, 8)
+        if sums:
+            state, end = (bounds[0] + 0, sums), bounds[-1]
+            _, sums = dr.while_loop(state, lambda i, _: i < end, add, max_iterations=-1, label="weights")
+            self.scattered = table_of([s * device.factor for s in sums], visit)
+        depths = [0.0] * channels
+        if kinds:
+            depths = optics.optical_depths(row(at.whole, device.ray, kinds))
+        self.reflected = table_of(
+            [
+                dr.exp(-t.Float(depth)) * device.on_ground * albedo * dr.inv_pi
+                for depth, albedo in zip(depths, optics.albedo, strict=True)
+            ],
+            visit,
         )
-        _, _, near, far = dr.while_loop(state, unfinished, advance, label="weights")
-        dr.eval(near, far)
-        has_previous = node > first
-        previous = dr.maximum(node, 1) - 1
-        weights = [n + dr.gather(t.Float, f, previous, has_previous) for n, f in zip(near, far, strict=True)]
-        self.weights = [dr.gather(t.Float, weight, d.station) * d.factor for weight in weights]
-        self.reflected = [
-            dr.gather(t.Float, dr.exp(-depth) * d.on_ground * albedo * dr.inv_pi, d.station)
-            for depth, albedo in zip(optics.optical_depths(before), optics.albedo, strict=True)
-        ]
-        dr.eval(self.weights, self.reflected)

@@ -1,92 +1,111 @@
-"""From radiance in discrete directions to the moments and the irradiance of the light of one order."""
+"""From radiance in discrete directions to the moments and the irradiance of the light of one order: sums over azimuth,
+then over zenith cosine."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, stored, types, uints
+from .backend import floats, packet, stored, types, uints
 from .grid import Grid
 from .harmonics import legendre, pair_count, pairs
 from .paths import Directions
-from .quadrature import half_circle
+
+TOGETHER = 4  # suns that one lane sums: they share the weights, and load in one packet
 
 
-@lru_cache(maxsize=32)
-def projection(grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int) -> Projection:
-    """The projection for a grid, kept with it."""
-    return Projection(grid, suns, directions, azimuths, degree, channels)
+def add_harmonics(sums: list[Any], values: list[Any], cos_phi: Any) -> list[Any]:
+    """Add ``values`` [channel] seen at the azimuth phi, times cos(m phi), to ``sums`` [m x channel]."""
+    channels = len(values)
+    new, cos_m, cos_before = [], 1.0, cos_phi
+    for m in range(len(sums) // channels):
+        new += [dr.fma(cos_m, v, s) for v, s in zip(values, sums[m * channels : (m + 1) * channels], strict=True)]
+        cos_m, cos_before = dr.fma(2.0 * cos_phi, cos_m, -cos_before), cos_m
+    return new
+
+
+def stored_harmonics(sums: list[Any], azimuths: int) -> Any:
+    """Sums [m x channel] over ``azimuths`` of the half circle, one lane per ray and sun, as azimuthal harmonics [m,
+    channel, rays, suns], evaluated."""
+    t = types()
+    share = dr.opaque(t.Float, 2.0 * np.pi / azimuths, 1)
+    out = dr.ravel(t.ArrayXf([share * s for s in sums]), order="C")
+    dr.eval(out)
+    return out
+
+
+def room(suns: int) -> int:
+    """Suns for which rays are gathered: whole blocks of TOGETHER."""
+    return -(-suns // TOGETHER) * TOGETHER
+
+
+@dataclass
+class Moments:
+    """Moments and irradiance of one order at the nodes: ``values`` [K, pairs + 1, room(suns), channels].
+
+    Moments are of degrees up to ``degree`` and azimuthal orders up to ``most``. The irradiance of a horizontal surface
+    facing up comes after the last pair. ``suns``: how many there are.
+    """
+
+    values: Any
+    degree: int
+    most: int
+    suns: int
+    channels: int
+
+    @property
+    def entries(self) -> int:
+        """Pairs and the irradiance."""
+        return pair_count(self.degree, self.most) + 1
+
+    def index(self, k: Any, entry: Any, sun: Any, channel: Any) -> Any:
+        """Place of a value."""
+        return ((k * self.entries + entry) * room(self.suns) + sun) * self.channels + channel
 
 
 class Projection:
-    """From radiance in discrete directions at the nodes to moments and irradiance: sums over azimuth, then over
-    zenith cosine."""
+    """From azimuthal harmonics at the nodes to moments and irradiance.
 
-    def __init__(
-        self, grid: Grid, suns: int, directions: Directions, azimuths: int, degree: int, channels: int
-    ) -> None:
-        t = types()
-        self.grid, self.suns, self.directions, self.azimuths, self.degree = grid, suns, directions, azimuths, degree
-        self.size = padded(channels)
-        self.count = directions.mu.shape[1]
-        m = np.arange(degree + 1)
-        self._cosines = floats(np.cos(m[:, None] * half_circle(azimuths)) * (2.0 * np.pi / azimuths))
-        basis = legendre(degree, directions.mu) * directions.weight[..., None]  # [K, D, pairs]
-        self._basis = floats(basis)
-        self._upward = floats(directions.facing_up)
-        self._m = uints(pairs(degree)[1])
-        self._types = t
+    Weights of the directions for every pair (l, m), and after them those of the irradiance.
+    """
 
-    def __call__(self, radiance: Any) -> tuple[Any, Any]:
-        """``radiance`` [K, D, S, azimuths, channels] -> moments [K, S, pairs, channels], irradiance [K, S,
-        channels]."""
-        t, size = self._types, self.size
-        altitudes, suns = self.grid.shape[0], self.suns
-        orders, count, azimuths = self.degree + 1, self.count, self.azimuths
-        lane = dr.arange(t.UInt, altitudes * count * orders * suns)
-        sun, rest = lane % suns, lane // suns
-        m, ray = rest % orders, rest // orders
-        start = (ray * suns + sun) * azimuths
+    def __init__(self, directions: Directions, degree: int, most: int) -> None:
+        self.degree, self.most = degree, most
+        self.altitudes, self.count = directions.mu.shape
+        count = pair_count(degree, most)
+        m = pairs(degree)[1][:count]
+        basis = legendre(degree, directions.mu)[..., :count] * directions.weight[..., None]  # [K, D, pairs]
+        basis = np.concatenate([basis, directions.facing_up[..., None]], axis=-1)
+        # One row per altitude and pair, directions within.
+        self._basis = floats(np.swapaxes(basis, 1, 2))
+        self._m = uints(np.append(m, 0))
+        self.entries = count + 1
 
-        def add_azimuth(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            weight = dr.gather(t.Float, self._cosines, m * azimuths + j)
-            values = packet(radiance, start + j, size)
-            return j + 1, [dr.fma(weight, v, s) for v, s in zip(values, sums, strict=True)]
+    @classmethod
+    def at(cls, grid: Grid, directions: Directions, degree: int, most: int) -> Projection:
+        """The projection for a grid, kept with it."""
+        return grid.kept(("projection", directions, degree, most), lambda: cls(directions, degree, most))
 
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(size)]
-        end = dr.opaque(t.UInt, azimuths, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add_azimuth, label="azimuths")
-        harmonics = stored(sums, lane, size)  # [K, D, m, S]
-
-        pair_total = pair_count(self.degree)
-        lane = dr.arange(t.UInt, altitudes * suns * pair_total)
-        pair, rest = lane % pair_total, lane // pair_total
-        sun, k = rest % suns, rest // suns
-        m = dr.gather(t.UInt, self._m, pair)
-        moments = self._sum_directions(
-            harmonics, k, m, sun, lambda ray: dr.gather(t.Float, self._basis, ray * pair_total + pair)
-        )
-        lane0 = dr.arange(t.UInt, altitudes * suns)
-        sun, k = lane0 % suns, lane0 // suns
-        irradiance = self._sum_directions(
-            harmonics, k, t.UInt(0), sun, lambda ray: dr.gather(t.Float, self._upward, ray)
-        )
-        return stored(moments, lane, size), stored(irradiance, lane0, size)
-
-    def _sum_directions(self, harmonics: Any, k: Any, m: Any, sun: Any, weight: Any) -> list[Any]:
-        t, size = self._types, self.size
-        suns, orders, count = self.suns, self.degree + 1, self.count
+    def __call__(self, harmonics: Any, suns: int, channels: int) -> Moments:
+        """``harmonics`` [m, channel, K, D, room(suns)] -> moments and irradiance."""
+        t, entries, count = types(), self.entries, self.count
+        blocks, per_harmonic = room(suns) // TOGETHER, self.altitudes * count * room(suns) // TOGETHER
+        lane = dr.arange(t.UInt, self.altitudes * entries * blocks)
+        block, rest = lane % blocks, lane // blocks
+        entry, k = rest % entries, rest // entries
+        first = dr.gather(t.UInt, self._m, entry) * (channels * per_harmonic) + k * (count * blocks) + block
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            ray = k * count + i
-            values = packet(harmonics, (ray * orders + m) * suns + sun, size)
-            w = weight(ray)
-            return i + 1, [dr.fma(w, v, s) for v, s in zip(values, sums, strict=True)]
+            weight = dr.gather(t.Float, self._basis, rest * count + i)
+            values = [packet(harmonics, first + i * blocks + c * per_harmonic, TOGETHER) for c in range(channels)]
+            return i + 1, [
+                dr.fma(weight, values[c][s], sums[s * channels + c]) for s in range(TOGETHER) for c in range(channels)
+            ]
 
-        zero = [dr.zeros(t.Float, dr.width(sun)) for _ in range(size)]
+        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(TOGETHER * channels)]
         end = dr.opaque(t.UInt, count, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, label="directions")
-        return sums
+        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, max_iterations=-1, label="directions")
+        return Moments(stored(sums, lane, len(sums)), self.degree, self.most, suns, channels)

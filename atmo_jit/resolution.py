@@ -6,44 +6,69 @@ The rules are measured, not derived: `python -m bench.accuracy` prints what they
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
-DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
+REMEMBERED = 64  # phase functions whose moments are kept
+REACH_DEGREE = 40  # of the moments that are kept
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Directions and azimuths (of the half circle) at a node for an order of scattering, and the moments that result:
+    degrees up to ``degree``, azimuthal orders up to ``most``."""
+
+    degree: int
+    most: int
+    up: int
+    down: int
+    azimuths: int
 
 
 @dataclass(frozen=True)
 class Resolution:
     """Numbers of nodes, directions and moments of a solve.
 
-    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``: parts into
-    which cubic interpolation divides every interval of either. ``up``, ``down``, ``azimuths``: directions at a node
-    for orders >= 2; ``degree``: highest l of their moments. ``first_*``: the same for order 1, whose forward peak is
-    sharper; ``phase_degree``: that of the phase functions there; ``beam_*``: altitude levels per interval and
-    azimuths at which sunlight is followed, phase functions apart. ``orders``: most orders solved. ``columns``: size
-    of the sun-column table (altitudes, cosines).
+    ``altitudes``, ``suns``: nodes solved for; ``first_suns``: times as many suns for order 1; ``refine``,
+    ``sun_refine``: parts into which cubic interpolation divides every interval of altitudes and suns for look-ups.
+    ``stages``: how orders 2, 3, ... are solved, the last serves all that follow; ``nodes``: Gauss points per piece of
+    their paths. ``first_*``: the same for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase
+    functions there; ``beam_*``: altitude levels per interval, azimuths and Gauss points at which sunlight is followed,
+    phase functions apart.
+    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``:
+    size of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
     suns: int = 25
-    refine: tuple[int, int] = (1, 4)
-    first_suns: int = 2
-    up: int = 6
-    down: int = 4
-    azimuths: int = 8
-    degree: int = 4
+    refine: int = 2
+    sun_refine: int = 4
+    first_suns: int = 1
+    stages: tuple[Stage, ...] = (Stage(4, 4, 6, 4, 6),)
+    nodes: int = 2
     first_up: int = 10
     first_down: int = 8
     first_azimuths: int = 14
     first_degree: int = 12
     phase_degree: int = 16
-    beam_refine: int = 6
-    beam_azimuths: int = 5
+    beam_refine: int = 2
+    beam_azimuths: int = 4
+    beam_nodes: int = 2
     orders: int = 40
+    converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """Degrees of phase moments that a solve asks for: one more than those of the moments of light."""
+        return tuple(sorted({self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
 
     @classmethod
     def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
@@ -52,57 +77,87 @@ class Resolution:
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter.
         """
-        first = _degree(atmosphere, power=2.0, target=0.1 * tolerance)
-        later = min(_degree(atmosphere, power=3.0, target=0.2 * tolerance), first)
+        first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
+        later = min(_degree(atmosphere, 2, 3, 0.02 * tolerance), first)
         if float(np.max(_depth(atmosphere))) > CLOUD:  # so many orders that no single one keeps its direction
             first, later = min(first, 16), min(later, 8)
-        fine = tolerance < 0.005
+        first = next(degree for degree in FIRST_DEGREES if degree >= first)
+        stages = [_stage(later), _stage((3 * later) // 4)]
+        level = int(np.searchsorted(-np.array(FINER), -tolerance))
         return cls(
-            altitudes=_altitudes(atmosphere, 16 if fine else 12),
-            refine=(2 if fine else 1, 4),
-            up=later + (4 if later > 6 else 2),
-            down=max(4, (4 * later) // 5 + 2),
-            azimuths=max(later, first // 2) + 1,
-            degree=later,
-            first_up=max(10, first + 2 if first > 12 else first),
-            first_down=max(8, first if first > 12 else first - 2),
+            altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level]),
+            suns=(21, 25, 29, 33)[level],
+            first_suns=(1, 2, 2, 2)[level],
+            stages=tuple(stages if stages[0] != stages[1] else stages[:1]),
+            first_up=max(10, first),
+            first_down=max(8, first - 2),
             first_azimuths=first + 4,
             first_degree=first,
             phase_degree=max(16, first + 4),
         )
 
 
-def _degree(atmosphere: Atmosphere, power: float, target: float) -> int:
-    """Smallest offered degree beyond which share * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
-    scatterer."""
+def _stage(degree: int) -> Stage:
+    """Directions for moments up to ``degree``: light varies less with azimuth than with the angle from the zenith,
+    which has the horizon in it."""
+    degree = max(degree, 2)
+    most = max(2, degree // 4 * 2)
+    return Stage(degree, most, max(5, degree + 2), max(3, degree), most + 1 + (most == 2))
+
+
+def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> int:
+    """Smallest degree >= 2 beyond which share^events * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
+    scatterer; at most the largest offered."""
     needed = 2
     for constituent in atmosphere.constituents:
         if constituent.phase is None:
             continue
         # How much of the light they meet these particles scatter.
-        depth = constituent.scattering_per_m * _column(atmosphere, constituent)
+        depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
         share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
-        for wavelength in range(len(atmosphere.wavelengths_nm)):
-            chi = np.abs(constituent.phase.at(wavelength).moments(DEGREES[-1]))
-            term = share[wavelength] * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0)
-            above = np.nonzero(term > target)[0]
+        shares: dict[Any, float] = {}
+        for wavelength, part in enumerate(share.tolist()):
+            phase = constituent.phase.at(wavelength)
+            shares[phase] = max(part, shares.get(phase, 0.0))
+        for phase, part in shares.items():
+            chi = np.abs(moments_of(phase, FIRST_DEGREES[-1]))
+            above = np.flatnonzero(part**events * chi**power * np.sqrt(2.0 * np.arange(len(chi)) + 1.0) > target)
             needed = max(needed, int(above[-1]) if len(above) else 0)
-    return next((degree for degree in DEGREES if degree >= needed), DEGREES[-1])
+    return needed
+
+
+def moments_of(phase: Any, degree: int) -> np.ndarray:
+    """Legendre moments of a phase function at one wavelength, kept."""
+    key = (type(phase), float(phase.g)) if hasattr(phase, "g") else phase
+    if key not in _moments:
+        while len(_moments) >= REMEMBERED:
+            _moments.pop(next(iter(_moments)))
+        _moments[key] = np.asarray(phase.moments(REACH_DEGREE))
+    return _moments[key][: degree + 1]
+
+
+_moments: dict[Any, np.ndarray] = {}
 
 
 def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
-    scattering = sum((c.scattering_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
+    scattering = sum(depths, start=np.zeros(1))
     extra = 8.0 * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
     return min(clear + 4 * int(np.ceil(extra / 4.0)), 40)
 
 
 def _depth(atmosphere: Atmosphere) -> np.ndarray:
     """Vertical optical depth [W]."""
-    return sum((c.extinction_per_m * _column(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
+    return sum((c.extinction_per_m * column_of(atmosphere, c) for c in atmosphere.constituents), start=np.zeros(1))
 
 
-def _column(atmosphere: Atmosphere, constituent: Constituent) -> float:
+def column_of(atmosphere: Atmosphere, constituent: Constituent) -> float:
     """Vertical column (m) of a constituent's density."""
-    h = atmosphere.thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
-    return float(np.trapezoid(np.asarray(constituent.profile.density(h)), h))
+    return _column(constituent.profile, atmosphere.thickness_m)
+
+
+@lru_cache(maxsize=64)
+def _column(profile: Any, thickness_m: float) -> float:
+    h = thickness_m * np.linspace(0.0, 1.0, 4097) ** 3
+    return float(np.trapezoid(np.asarray(profile.density(h)), h))

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, parameter, stored, types
+from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, types
 from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
@@ -16,34 +16,46 @@ from .march import Rays, point_along, visible_sun
 from .optics import PHASE_NODES, Optics
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
+from .projection import add_harmonics, room, stored_harmonics
 from .quadrature import cosine_interpolation, half_circle
 from .resolution import Resolution
 
 
 class Sunbeam:
-    """Direct sunlight at altitude levels: transmittance toward the sun times the visible part of its disc, linear in
-    mu_s.
+    """Direct sunlight at the levels of paths: transmittance toward the sun times the visible part of its disc, linear
+    in mu_s.
 
     ``table`` [levels, COSINES, size]: from the lowest mu_s at which the top still sees the sun up to 1.
     """
 
     COSINES = 768
 
-    def __init__(self, optics: Optics, columns: SunColumns, levels: np.ndarray) -> None:
+    def __init__(self, optics: Optics, columns: SunColumns, paths: Paths) -> None:
         t = types()
         self.optics, self.size = optics, padded(optics.channel_count)
         radius, top = optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m
         dip = np.arccos(radius / (radius + top)) + np.deg2rad(optics.atmosphere.sun_angular_radius_deg)
         lowest = max(-np.sin(min(dip, 0.5 * np.pi)), -1.0)
         self._lowest, self._per_step = parameter(lowest), parameter((self.COSINES - 1) / (1.0 - lowest))
-        lane = dr.arange(t.UInt, len(levels) * self.COSINES)
-        h = dr.gather(t.Float, floats(levels), lane // self.COSINES)
-        mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
-        seen = visible_sun(optics, h, optics.radius + h, mu_s)
-        depths = optics.optical_depths(columns.toward(h, mu_s))
-        self._table = stored(
-            [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)], lane, self.size
-        )
+        kinds = len(optics.constituents)
+
+        def beams() -> Any:
+            lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
+            h = dr.gather(t.Float, floats(paths.levels), lane // self.COSINES)
+            mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
+            seen = visible_sun(optics, h, optics.radius + h, mu_s)
+            return table_of([seen, *columns.toward(h, mu_s)], lane)
+
+        if optics.profiles_differentiable:
+            held = beams()
+        else:
+            keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
+            held = keeper.kept(("sunbeams", paths.refine), beams)
+        lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
+        seen, *column = row(held, lane, 1 + kinds)
+        depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
+        light = [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)]
+        self._table = stored(light, lane, self.size)
 
     def at(self, level: Any, mu_s: Any) -> list[Any]:
         """Irradiance normal to the beam per channel, at a level and a sun cosine; 0 below the lowest."""
@@ -58,107 +70,114 @@ class Sunbeam:
 
 
 def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Directions, r: Resolution) -> Any:
-    """Radiance of order 1 at the nodes, [K, D, S, first_azimuths, size]: single scattering and directly lit ground.
+    """Light of order 1 at the nodes, single scattering and directly lit ground, as azimuthal harmonics
+    (projection.Projection) of degree ``first_degree``.
 
     Without its phase function, single scattering changes slowly with azimuth: it is gathered along the paths at a few
     azimuths, interpolated by its cosine series, and only then multiplied by the phase function of the angle to the
     sun. Phase functions are smoothed to ``phase_degree``: a peak narrower than the directions would be hit or missed
     by them.
     """
-    paths = paths_along(grid, directions, r.beam_refine)
-    weights = PathWeights(optics, paths)
-    beam = Sunbeam(optics, columns, grid.levels_at(r.beam_refine))
-    glow = _beam_along(optics, beam, paths, weights, grid, r.beam_azimuths)
-    return _times_phase(optics, glow, grid, directions, r)
+    paths = paths_along(grid, directions, r.beam_refine, of_their_own=True)
+    weights = PathWeights(optics, paths, r.beam_nodes)
+    beam = Sunbeam(optics, columns, paths)
+    glow = beam_along(optics, beam, paths, weights, _suns(grid), r.beam_azimuths)
+    return _times_phase(optics, *glow, grid, directions, r)
 
 
-def _beam_along(optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, grid: Grid, azimuths: int) -> Any:
-    """Scattered sunlight per scatterer without its phase function, then light from the ground: [rays, S, azimuths, 1
-    + scatterers, size]."""
+def beam_along(
+    optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, theta: Any, azimuths: int
+) -> tuple[Any, Any]:
+    """Sunlight scattered along the paths without the phase functions, a table [rays, suns, azimuths x scatterers x
+    channels], and light from the ground, [rays, suns, azimuths x channels]. ``theta`` [suns, 2]: cosine and sine of
+    the sun's zenith angle where the paths start."""
     t = types()
-    kinds, channels, size = len(optics.scatterers), optics.channel_count, beam.size
-    suns = len(grid.first_theta)
-    lane = dr.arange(t.UInt, len(paths.h) * suns * azimuths)
-    azimuth, rest = lane % azimuths, lane // azimuths
-    sun, ray = rest % suns, rest // suns
-    mu_s = dr.gather(t.Float, floats(np.cos(grid.first_theta)), sun)
-    across = dr.gather(t.Float, floats(np.sin(grid.first_theta)), sun) * dr.gather(
-        t.Float, floats(np.cos(half_circle(azimuths))), azimuth
-    )
-    visits = len(paths.station)
+    channels, kinds = optics.channel_count, len(optics.scatterers)
+    suns = dr.width(theta) // 2
+    lane = dr.arange(t.UInt, len(paths.h) * suns)
+    sun, ray = lane % suns, lane // suns
+    mu_s, sin_s = packet(theta, sun, 2)
+    across = [sin_s * float(c) for c in np.cos(half_circle(azimuths))]
     device = paths.device
-    rows = stored(
-        [weights.weights[n * channels + c] if c < channels else t.Float(0.0) for n in range(kinds) for c in range(size)]
-        or [t.Float(0.0)],
-        dr.arange(t.UInt, visits),
-        max(kinds * size, 1),
-    )
     start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
 
-    def turned(visit: Any) -> Any:
+    def turned(visit: Any) -> list[Any]:
         cos_turn, sin_turn = packet(device.turns, visit, 2)
-        return dr.fma(cos_turn, mu_s, sin_turn * across)
+        return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        light = beam.at(dr.gather(t.UInt, device.level, i), turned(i))
-        weight = packet(rows, i, kinds * size)
-        return i + 1, [
-            dr.fma(weight[n * size + c], light[c], sums[n * channels + c])
-            for n in range(kinds)
-            for c in range(channels)
-        ]
+    def visit(i: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+        weight, level = row(weights.scattered, i, kinds * channels), dr.gather(t.UInt, device.level, i)
+        new = []
+        for mu, old in zip(turned(i), sums, strict=True):
+            light = beam.at(level, mu)
+            new.append([dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=True))])
+        return i + 1, new
 
-    sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * channels)]
-    if kinds:
-        _, sums = dr.while_loop((start, sums), lambda i, _: i < stop, visit, label="beam")
+    sums = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * channels)] for _ in range(azimuths)]
     end = stop - 1
-    falling_on = turned(end)
-    lit = beam.at(t.UInt(0), falling_on)
-    dr.make_opaque(lit)
-    reflected = [
-        dr.gather(t.Float, weights.reflected[c], end) * dr.maximum(falling_on, 0.0) * lit[c] for c in range(channels)
-    ]
-    blank = [t.Float(0.0)] * (size - channels)
-    out = [*reflected, *blank]
-    for n in range(kinds):
-        out += [*sums[n * channels : (n + 1) * channels], *blank]
-    return stored(out, lane, (1 + kinds) * size)
+    if kinds:
+        _, sums = dr.while_loop((start, sums), lambda i, _: i < stop, visit, max_iterations=-1, label="beam")
+    reflected = row(weights.reflected, end, channels)
+    ground = []
+    for mu in turned(end):
+        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, beam.at(t.UInt(0), mu), strict=True)]
+    scattered = [value for part in sums for value in part] or [t.Float(0.0)]
+    return table_of(scattered, lane), table_of(ground, lane)
 
 
-def _times_phase(optics: Optics, glow: Any, grid: Grid, directions: Directions, r: Resolution) -> Any:
-    """Radiance [K, D, S, first_azimuths, size] from the ground's and the scatterers' parts at ``beam_azimuths``."""
+def _suns(grid: Grid) -> Any:
+    """Cosine and sine of the suns of order 1, [suns, 2], the last repeated to fill the room."""
+    theta = np.pad(grid.first_theta, (0, room(len(grid.first_theta)) - len(grid.first_theta)), mode="edge")
+    return grid.kept("first suns", lambda: floats(np.column_stack([np.cos(theta), np.sin(theta)])))
+
+
+def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, directions: Directions, r: Resolution) -> Any:
+    """Azimuthal harmonics of what the scatterers and the ground send, given at ``beam_azimuths``."""
     t = types()
-    kinds, channels, size = len(optics.scatterers), optics.channel_count, padded(optics.channel_count)
-    suns, azimuths, few = len(grid.first_theta), r.first_azimuths, r.beam_azimuths
-    rays = directions.mu.size
-    lane = dr.arange(t.UInt, rays * suns * azimuths)
-    azimuth, rest = lane % azimuths, lane // azimuths
-    mu = dr.gather(t.Float, floats(directions.mu), rest // suns)
-    mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.first_theta)), rest % suns) for f in (np.cos, np.sin))
-    cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
-    nu = dr.clip(dr.fma(mu, mu_s, safe_sine(mu) * sin_s * cos_phi), -1.0, 1.0)
-    taps = floats(cosine_interpolation(few, half_circle(azimuths)))
-    count = dr.opaque(t.UInt, few, 1)
+    kinds, channels = len(optics.scatterers), optics.channel_count
+    suns, azimuths, few, degree = room(len(grid.first_theta)), r.first_azimuths, r.beam_azimuths, r.first_degree
+    lane = dr.arange(t.UInt, directions.mu.size * suns)
+    sun, ray = lane % suns, lane // suns
+    mu = dr.gather(t.Float, grid.kept(("mu", directions), lambda: floats(directions.mu)), ray)
+    mu_s, sin_s = packet(_suns(grid), sun, 2)
+    along, across = mu * mu_s, safe_sine(mu) * sin_s
+
+    def rule() -> Any:
+        phi = half_circle(azimuths)
+        return table(np.column_stack([np.cos(phi), cosine_interpolation(few, phi)]))
+
+    steps = grid.kept(("azimuths", azimuths, few), rule)
+    width = kinds * channels
+    held = row(scattered, lane, few * width) if kinds else []
+    held, lit = [held[j::width] for j in range(width)], row(ground, lane, few * channels)
+    lit = [lit[j::channels] for j in range(channels)]
+    phases = optics.phase_table(r.phase_degree)
 
     def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        values = packet(glow, rest * few + j, (1 + kinds) * size)
-        tap = dr.gather(t.Float, taps, azimuth * few + j)
-        return j + 1, [dr.fma(tap, v, s) for v, s in zip(values, sums, strict=True)]
+        cos_phi, *taps = row(steps, j, 1 + few)
+        nu = dr.clip(dr.fma(across, cos_phi, along), -1.0, 1.0)
+        values = [dr.maximum(_dot(taps, part), 0.0) for part in lit]
+        if kinds:
+            x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
+            cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
+            f = x - t.Float(cell)
+            low, high = row(phases, cell, width), row(phases, cell + 1, width)
+            for i, part in enumerate(held):
+                glow = dr.maximum(_dot(taps, part), 0.0)
+                values[i % channels] = dr.fma(glow, dr.fma(f, high[i] - low[i], low[i]), values[i % channels])
+        return j + 1, add_harmonics(sums, values, cos_phi)
 
-    zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((1 + kinds) * size)]
-    _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < count, add, label="azimuths")
-    values = [dr.maximum(v, 0.0) for v in sums[:channels]]
-    if kinds:
-        table = optics.phase_table(r.phase_degree, size)
-        x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
-        cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
-        f = x - t.Float(cell)
-        low, high = packet(table, cell, kinds * size), packet(table, cell + 1, kinds * size)
-        for n in range(kinds):
-            for c in range(channels):
-                i = n * size + c
-                values[c] = dr.fma(dr.maximum(sums[size + i], 0.0), dr.fma(f, high[i] - low[i], low[i]), values[c])
-    return stored(values, lane, size)
+    zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((degree + 1) * channels)]
+    end = dr.opaque(t.UInt, azimuths, 1)
+    _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="phases")
+    return stored_harmonics(sums, azimuths)
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total
 
 
 def horizontal_irradiance(

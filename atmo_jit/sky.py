@@ -19,8 +19,9 @@ import numpy as np
 
 from . import __version__
 from .atmosphere import Atmosphere
-from .backend import doubles, types
-from .column import SunColumns
+from .backend import doubles, floats, types
+from .bundle import Bundle
+from .column import sun_columns
 from .errors import InputError
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
@@ -46,11 +47,18 @@ class _Band:
     """The solution at up to four wavelengths."""
 
     def __init__(
-        self, atmosphere: Atmosphere, indices: np.ndarray, resolution: Resolution, orders: int | None, tolerance: float
+        self,
+        atmosphere: Atmosphere,
+        indices: np.ndarray,
+        resolution: Resolution,
+        orders: int | None,
+        tolerance: float,
+        suns: tuple[float, float] | None,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        self.columns = SunColumns(self.optics, resolution.columns)
-        self.field = solve(self.optics, self.columns, Grid.of(atmosphere, resolution), resolution, orders, tolerance)
+        grid = Grid.of(atmosphere, resolution, suns)
+        self.columns = sun_columns(self.optics, grid)
+        self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 
@@ -59,11 +67,17 @@ class Sky:
 
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
-    the resolution follows unless it is given. Raises AtmosphereError, LLVMError, InputError.
+    the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
+    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
-        self, atmosphere: Any, orders: int | None = None, tolerance: float = 0.01, resolution: Resolution | None = None
+        self,
+        atmosphere: Any,
+        orders: int | None = None,
+        tolerance: float = 0.01,
+        resolution: Resolution | None = None,
+        suns: tuple[float, float] | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
@@ -74,11 +88,13 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance) for band in bands]
+        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
 
     @property
     def bands(self) -> list[_Band]:
-        """The solution at up to four wavelengths each: what tables are baked from."""
+        """The solution at up to four wavelengths each, with its tables for look-ups made: what tables are baked from."""
+        for band in self._bands:
+            band.field.prepare()
         return self._bands
 
     def rays(
@@ -104,6 +120,7 @@ class Sky:
         disc = self._disc(rays, passes) if sun_disc else None
         for band in self._bands:
             optics = band.optics
+            band.field.prepare()
             light = march(optics, band.columns, rays, source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
@@ -118,6 +135,41 @@ class Sky:
                     radiance[c] = dr.fma(disc * solar, transmittance[c], radiance[c])
         return RayLight(radiance, transmittance)
 
+    def table(
+        self, altitude_m: Any, view_zenith: Any, sun_zenith: Any, azimuth: Any, *, ground: bool = True
+    ) -> RayLight:
+        """Radiance for every combination of P views, S suns and A azimuths, far faster than ray by ray (bundle.py).
+
+        ``altitude_m`` (0 to the top of the air) and ``view_zenith`` [P]: where rays start, and their zenith angle
+        there; ``sun_zenith`` [S] at the start, ``azimuth`` [A] of the view minus that of the sun, or [P, S, A];
+        radians. Radiance comes as W Floats [P, S, A] flattened, transmittance as W Floats [P].
+        """
+        view, height, sun = (np.atleast_1d(np.asarray(v, float)) for v in (view_zenith, altitude_m, sun_zenith))
+        height, view = np.broadcast_arrays(height, view)
+        top = self.atmosphere.thickness_m
+        if height.ndim != 1 or sun.ndim != 1 or height.min() < 0.0 or height.max() > top:
+            raise InputError(f"altitude_m: lists of altitudes from 0 to {top:g} m, the top of the air, are allowed")
+        cosines = np.cos(np.asarray(azimuth, float))
+        if cosines.ndim > 1 and cosines.shape[:2] != (len(height), len(sun)):
+            raise InputError(f"azimuth: has shape {cosines.shape}; must be [A] or [{len(height)}, {len(sun)}, A]")
+        cosines = floats(np.broadcast_to(cosines, (len(height), len(sun), cosines.shape[-1])))
+        radiance, transmittance = [], []
+        for band in self._bands:
+            bundle = self._bundle(band, height, np.cos(view))
+            radiance += bundle.radiance(band.optics, band.columns, band.field, sun, cosines, ground=ground)
+            transmittance += bundle.transmittance(band.optics)
+        return RayLight(radiance, transmittance)
+
+    @staticmethod
+    def _bundle(band: _Band, h: np.ndarray, mu: np.ndarray) -> Bundle:
+        """The paths of the last table, as long as the same are asked for."""
+        key, grid = (h.tobytes(), mu.tobytes()), band.field.grid
+        last = grid.kept("last bundle", dict)
+        if key not in last:
+            last.clear()
+            last[key] = Bundle(grid, h, mu)
+        return last[key]
+
     def irradiance(self, altitude_m: Any, sun_zenith: Any) -> tuple[list[Any], list[Any]]:
         """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``:
         lists of W Floats."""
@@ -127,6 +179,7 @@ class Sky:
         dr.make_opaque(h, mu_s)
         sun, sky = [], []
         for band in self._bands:
+            band.field.prepare()
             direct, scattered = horizontal_irradiance(band.optics, band.columns, band.field, h, mu_s)
             sun += direct
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]

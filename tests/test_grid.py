@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import atmo_jit
-from atmo_jit.backend import floats
+from atmo_jit.backend import floats, types
 from atmo_jit.grid import Grid
+from atmo_jit.refinement import Taps
 from atmo_jit.resolution import Resolution
 
 EARTH = atmo_jit.Atmosphere.load("earth")
@@ -21,28 +22,39 @@ def test_nodes_span_the_air_and_the_sun_s_way():
     assert g.theta[0] == 0.0 and np.all(np.diff(g.theta) > 0) and np.degrees(g.theta[-1]) > 100
     day, twilight = np.diff(g.theta)[2], np.min(np.diff(g.theta))
     assert day > 3 * twilight
-    assert set(np.round(g.h, 3)) <= set(np.round(g.levels, 3))
-    assert np.allclose(g.first_theta[::2], g.theta)
+    assert set(np.round(g.h, 3)) <= set(np.round(g.levels_at(3), 3))
+    assert np.allclose(grid(altitudes=12, suns=25, first_suns=2).first_theta[::2], g.theta)
 
 
 def test_locate_finds_the_nodes():
-    g = grid(altitudes=12, suns=25, refine=(2, 4))
-    level, share = g.locate_altitude(floats(g.levels))
-    found = level.numpy() + share.numpy()
-    assert found == pytest.approx(np.arange(len(g.levels)), abs=2e-3)
+    g = grid(altitudes=12, suns=25, refine=2, sun_refine=4)
+    level, share = g.locate_altitude(floats(g.levels_at(2)))
+    assert level.numpy() + share.numpy() == pytest.approx(np.arange(23), abs=2e-3)
     sun, share = g.locate_sun(floats(np.cos(g.theta)))
     assert sun.numpy() + share.numpy() == pytest.approx(4 * np.arange(25), abs=5e-3)
 
 
-def test_refinement_is_exact_for_parabolas_and_keeps_parity():
-    g = grid(altitudes=12, suns=25, refine=(2, 4))
-    x = np.arange(25.0)
-    fine = np.arange(97) / 4
-    even, odd = g.sun_refinement
-    inside = fine < 23  # the last interval goes straight on
-    assert (even @ (3 - x**2))[inside] == pytest.approx((3 - fine**2)[inside])
-    assert (odd @ (2 * x))[inside] == pytest.approx((2 * fine)[inside])
-    assert np.allclose(even.sum(axis=1), 1.0)
+def test_a_range_of_suns_keeps_the_nodes_of_the_full_grid():
+    whole = Grid(EARTH, Resolution())
+    part = Grid(EARTH, Resolution(), tuple(np.radians([60.0, 62.0])))
+    assert set(part.theta) < set(whole.theta) and len(part.theta) < len(whole.theta)
+    assert part.theta[0] < np.radians(60.0) and part.theta[-1] > np.radians(62.0)
+    inside = floats(np.cos(part.theta))
+    assert part.sun_position(inside).numpy() == pytest.approx(np.arange(len(part.theta)), abs=2e-3)
+
+
+def test_taps_are_exact_for_parabolas_and_keep_parity():
+    g = grid(suns=25)
+    fine = np.arange(93) / 4  # up to the last but one interval: beyond the last node the last is repeated
+    taps = Taps(g, floats(fine), 25)
+    even = taps.sum([3 - _as_float(at) ** 2 for at in taps.at], 1.0)
+    odd = taps.sum([2 * _as_float(at) for at in taps.at], -1.0)
+    assert even.numpy() == pytest.approx(3 - fine**2, rel=1e-5, abs=1e-4)
+    assert odd.numpy() == pytest.approx(2 * fine, rel=1e-5, abs=1e-4)
+
+
+def _as_float(index):
+    return types().Float(index)
 
 
 def test_a_small_change_of_haze_moves_no_node():

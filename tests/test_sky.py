@@ -7,6 +7,8 @@ import pytest
 from twins import Twin
 
 import atmo_jit
+from atmo_jit.backend import doubles
+from atmo_jit.sky import Sky
 from bench.worlds import WORLDS, views_of, world
 
 SPEC = WORLDS["small planet"]
@@ -281,3 +283,31 @@ def test_single_numbers_and_lists_are_views():
         SPEC, {"altitude_m": 2.0, "sun_zenith_deg": 60.0, "view_zenith_deg": [0.0, 45.0], "azimuth_deg": 90.0}, orders=1
     )
     assert result.radiance.shape == (2, 3)
+
+
+@pytest.mark.parametrize("sun_deg", [0.0, 50.0, 91.0])
+def test_a_range_of_suns_gives_what_all_suns_give(sun_deg):
+    """Nodes farther away than light comes from cannot matter: 2e-4 is ten times what they do."""
+    views = {
+        "altitude_m": np.array([0.0, 0.0, 4000.0, 30000.0, 2e5]),
+        "view_zenith": np.radians([20.0, 88.0, 110.0, 60.0, 160.0]),
+        "azimuth": np.radians([0.0, 60.0, 120.0, 180.0, 30.0]),
+    }
+    sun = np.radians(sun_deg)
+    whole, part = (
+        np.stack(
+            [
+                v.numpy()
+                for v in Sky("earth", suns=suns)
+                .rays(
+                    doubles(views["altitude_m"]),
+                    doubles(np.full(5, sun)),
+                    doubles(views["view_zenith"]),
+                    doubles(views["azimuth"]),
+                )
+                .radiance
+            ]
+        )
+        for suns in (None, (sun, sun))
+    )
+    assert part == pytest.approx(whole, rel=2e-4)
