@@ -8,7 +8,8 @@ and the next follows by gathering along straight paths from every node.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -70,6 +71,20 @@ def solve(
     return Field(optics, columns, grid, reference, degree, moments, sky, reflected, scatters=again)
 
 
+_always_traced = False
+
+
+@contextmanager
+def traced() -> Iterator[None]:
+    """Solves in this block are traced and not played back, for those who look at their kernels."""
+    global _always_traced
+    before, _always_traced = _always_traced, True
+    try:
+        yield
+    finally:
+        _always_traced = before
+
+
 class _Steps:
     """The parts of a solve as functions of an atmosphere's values alone.
 
@@ -124,7 +139,7 @@ class _Steps:
         )
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        if self._optics.profiles_differentiable or dr.grad_enabled(arguments):
+        if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
             return function(*arguments)
         if key not in self._used:
             self._used.add(key)

@@ -93,6 +93,8 @@ class Resolution:
             first_down=max(8, first - 2),
             first_azimuths=first + 4,
             first_degree=first,
+            # Two levels leave 3 % of the light that twilight brings to the ground of a small planet.
+            beam_refine=(2, 3, 3, 3)[level],
             phase_degree=max(16, first + 4),
         )
 

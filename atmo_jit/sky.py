@@ -92,7 +92,7 @@ class Sky:
 
     @property
     def bands(self) -> list[_Band]:
-        """The solution at up to four wavelengths each, with its tables for look-ups made: what tables are baked from."""
+        """The solution at up to four wavelengths each, its look-up tables made: what tables are baked from."""
         for band in self._bands:
             band.field.prepare()
         return self._bands

@@ -176,6 +176,13 @@ def stages(work: Callable[[], Any], limits: dict[str, float]) -> list[dict[str, 
 
     ``work`` is called once to compile, RUNS times to be timed (the least counts) and once with counters.
     """
+    from atmo_jit.multiple_scattering import traced
+
+    with traced():
+        return _stages(work, limits)
+
+
+def _stages(work: Callable[[], Any], limits: dict[str, float]) -> list[dict[str, Any]]:
     work()
     seconds: dict[tuple[str, ...], float] = {}
     for _ in range(RUNS):
