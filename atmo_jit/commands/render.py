@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import time
@@ -172,6 +173,8 @@ class Passes:
         self._sizes = list(pass_sizes(self.total, int(np.prod(self._film.crop_size())), most))
         if len(self._sizes) == 1 and self.total > 1:  # one pass knows no standard error
             self._sizes = [self.total // 2, self.total - self.total // 2]
+        # A film with more pixels than a pass may have samples is rendered in strips.
+        self._strips = list(strips(*(int(n) for n in self._film.crop_size()), most))
         self.samples, self.seed = 0, 0
         self._sums: np.ndarray | float = 0.0
         # Of the passes' own pictures x with n samples each: sums of n x, n^2 x, n^2 x^2, n^2.
@@ -181,9 +184,7 @@ class Passes:
         """Render, one pass at each step; ``advance`` is called with the fraction done."""
         done = 0
         for seed, count in enumerate(self._sizes):
-            integrator = self._scene.integrator()
-            integrator.render(self._scene, self._sensor, seed=self.seed + seed, spp=count, develop=False, evaluate=True)
-            raw = np.array(self._film.develop(raw=True), dtype=np.float64)
+            raw = self._pass(self.seed + seed, count)
             taken = self._sampler.sample_count()
             x = _developed(self._film, raw).pixels.astype(np.float64)
             terms = (taken * x, taken**2 * x, taken**2 * x * x, float(taken**2))
@@ -193,6 +194,40 @@ class Passes:
             done += count
             advance(done / self.total)
             yield
+
+    def _pass(self, seed: int, count: int) -> np.ndarray:
+        """The film's weighted sums after ``count`` samples per pixel, float64."""
+        integrator = self._scene.integrator()
+
+        def taken(number: int) -> np.ndarray:
+            integrator.render(self._scene, self._sensor, seed=number, spp=count, develop=False, evaluate=True)
+            return np.array(self._film.develop(raw=True), dtype=np.float64)
+
+        if len(self._strips) == 1:
+            return taken(seed)
+        import mitsuba as mi
+
+        width, height = (int(v) for v in self._film.crop_size())
+        left, top = (int(v) for v in self._film.crop_offset())
+        reach = math.ceil(self._film.rfilter().radius())
+
+        def crop(first: int, rows: int) -> None:
+            parameters = mi.traverse(self._sensor)
+            parameters["film.crop_size"] = mi.ScalarVector2u(width, rows)
+            parameters["film.crop_offset"] = mi.ScalarPoint2u(left, top + first)
+            parameters.update()
+
+        parts = []
+        try:
+            for number, (first, rows) in enumerate(self._strips):
+                # Samples beyond a strip count in it as far as the film's filter reaches.
+                begin, end = max(first - reach, 0), min(first + rows + reach, height)
+                crop(begin, end - begin)
+                # Seeds of a strip are those of the passes of no other one.
+                parts.append(taken(seed * len(self._strips) + number)[first - begin :][:rows])
+        finally:
+            crop(0, height)
+        return np.concatenate(parts)
 
     def picture(self) -> Picture:
         """The picture of the passes done."""
@@ -223,6 +258,13 @@ def pass_sizes(spp: int, pixels: int, limit: int = PASS_SAMPLES) -> Iterator[int
             size //= 2
         yield size
         spp -= size
+
+
+def strips(width: int, height: int, limit: int) -> Iterator[tuple[int, int]]:
+    """First row and number of rows of the parts of a film that have at most ``limit`` pixels each (or one row)."""
+    rows = max(1, limit // width)
+    for first in range(0, height, rows):
+        yield first, min(rows, height - first)
 
 
 def _developed(film: Any, sums: np.ndarray) -> Picture:

@@ -282,3 +282,30 @@ def on_a_terminal(command):
     os.close(terminal)
     assert process.wait() == 0
     return text.decode()
+
+
+def test_strips_cover_the_film():
+    for width, height, limit in ((3840, 2160, 2**19), (7, 5, 1), (640, 360, 2**21), (10, 9, 25)):
+        parts = list(render.strips(width, height, limit))
+        assert [first for first, _ in parts] == list(np.cumsum([0, *(rows for _, rows in parts)])[:-1])
+        assert sum(rows for _, rows in parts) == height
+        assert all(rows * width <= limit or rows == 1 for _, rows in parts)
+
+
+def test_large_films_are_rendered_in_strips(monkeypatch):
+    """The same picture, within its noise, whether a pass is of the whole film or of a few rows; the film is left as it
+    was.
+    """
+    with render._mitsuba("llvm_ad_rgb"):
+        scene = render._load(scenes.find("ball"), {}, 24, 14, False)
+        pictures, errors = [], []
+        for most in (2**21, 24 * 4):
+            passes = render.Passes(scene, 64, most)
+            for _ in passes.run(lambda fraction: None):
+                continue
+            pictures.append(passes.picture().pixels[..., :3])
+            errors.append(passes.standard_error().pixels[..., :3])
+            assert tuple(scene.sensors()[0].film().crop_size()) == (24, 14)
+    difference, sigma = pictures[0] - pictures[1], np.hypot(*errors)
+    assert pictures[0].shape == pictures[1].shape == (14, 24, 3)
+    assert np.sqrt(np.mean((difference / np.maximum(sigma, 1e-3 * pictures[0])) ** 2)) < 1.5
