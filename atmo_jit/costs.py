@@ -24,16 +24,16 @@ VIEWS_AT_ONCE = 1 << 18  # of atmo_jit.sky: bounds memory
 
 # --- printed by `python -m bench.constants` ---
 # CPU seconds per unit of each loop's size (see `loop_sizes`), kernels warm.
-SECONDS = {"fixed": 0.032, "beam": 2.44e-08, "project": 0, "gather": 0, "contract": 3.08e-08}
+SECONDS = {"fixed": 0.012, "beam": 8.56e-09, "project": 1.63e-09, "gather": 1.3e-08, "contract": 0}
 # CPU seconds of a view: first for every band of wavelengths, then for each moment of it.
-RAY_SECONDS = {"band": 2.99e-06, "moment": 2.45e-07}
+RAY_SECONDS = {"band": 3e-06, "moment": 2.65e-07}
 # MiB beyond imports: fixed, per square of the MiB of the largest table of order 1 (tables along the paths between the
 # nodes grow with the square of those at the nodes), per view evaluated at once.
-MEMORY = {"fixed": 16.5, "square": 2.96, "view": 0.000286}
+MEMORY = {"fixed": 10.7, "square": 0.374, "view": 0.000293}
 # 95th percentile of the error (per cent) by tolerance: clear air, haze, against independent references.
-ERRORS = {0.1: (0.698, 1.17), 0.03: (0.483, 0.607), 0.01: (0.339, 0.663), 0.003: (0.245, 0.402), 0.001: (0.233, 0.407)}
+ERRORS = {0.1: (1.1, 0.907), 0.03: (0.725, 0.773), 0.01: (0.401, 0.424), 0.003: (0.271, 0.327), 0.001: (0.22, 0.302)}
 # CPU nanoseconds of a pass of the bare loop of `bare_nanoseconds` on the machine that the constants are from.
-BARE_NANOSECONDS = 4.46
+BARE_NANOSECONDS = 3.72
 # --- end ---
 
 HAZE_DEPTH = 0.05  # optical depth of aerosol from which the second column of ERRORS holds
@@ -93,7 +93,7 @@ def loop_sizes(resolution: Resolution, orders: int) -> dict[str, float]:
     ``beam``: sunlight along the paths; ``project``: moments of order 1; ``gather``, ``contract``: the later orders.
     """
     r = resolution
-    later = last_stage(r)
+    later = r.stages[-1]
     first_nodes = r.altitudes * (r.first_up + r.first_down) * r.suns * r.first_suns
     paths = r.altitudes * (later.up + later.down) * r.altitudes
     gathers = max(orders - 1, 0)
@@ -104,11 +104,6 @@ def loop_sizes(resolution: Resolution, orders: int) -> dict[str, float]:
         "gather": gathers * paths * r.suns * later.azimuths * (later.degree + 1),
         "contract": gathers * paths * r.suns * pair_count(later.degree),
     }
-
-
-def last_stage(resolution: Resolution) -> Any:
-    """Directions, azimuths and degree of most orders: the last of the resolution's stages, where it has several."""
-    return getattr(resolution, "stages", (resolution,))[-1]
 
 
 def table_mib(resolution: Resolution, channels: int) -> float:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .atmosphere import Atmosphere
-from .costs import Cost, band_sizes, last_stage, orders_expected, predict
+from .costs import Cost, band_sizes, orders_expected, predict
 from .errors import InputError
 from .harmonics import pair_count
 from .resolution import Resolution
@@ -263,7 +263,7 @@ def _matter(air: Atmosphere, kept: Atmosphere) -> list[Item]:
 
 
 def _multiple(kept: Atmosphere, r: Resolution, tolerance: float, orders: int | None) -> list[Item]:
-    later = last_stage(r)
+    later = r.stages[-1]
     suns = f"{r.altitudes} altitudes x {r.suns} suns"
     columns = Item("sun columns", True, f"{r.columns[0]} x {r.columns[1]}", "sunlight anywhere in the air")
     if not any(np.any(c.scattering_per_m > 0) for c in kept.constituents):
@@ -280,7 +280,7 @@ def _multiple(kept: Atmosphere, r: Resolution, tolerance: float, orders: int | N
     size = f"{suns}, l <= {later.degree} ({pair_count(later.degree)} moments)"
     found.append(Item("moments of later orders", True, size, "each order smooths: fewer moments are left"))
     for nm, one, air in zip(kept.wavelengths_nm, single, (_at(kept, w) for w in range(len(single))), strict=True):
-        last = last_stage(one)
+        last = one.stages[-1]
         count = orders or orders_expected(air, tolerance, r.orders)
         size = f"l <= {one.first_degree}, then {last.degree}; {count} orders"
         found.append(Item(f"needed at {nm:g} nm", True, size, "the band is solved with the most that one needs"))

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from atmo_jit.atmosphere import Atmosphere
-from atmo_jit.costs import Cost, last_stage
+from atmo_jit.costs import Cost
 from atmo_jit.errors import AtmosphereError, InputError
 from atmo_jit.harmonics import pair_count
 from atmo_jit.plan import TABLE_NODES, Needs, compared, plan
@@ -68,7 +68,7 @@ def test_species_keep_their_names_where_one_is_free():
 
 def test_gas_alone_needs_four_moments():
     planned = made(EARTH.replace({"mie": None}))
-    assert last_stage(planned.resolution).degree == 2 and "four moments" in item(planned, "moments of order 1").reason
+    assert planned.resolution.stages[-1].degree == 2 and "four moments" in item(planned, "moments of order 1").reason
     assert f"({pair_count(2)} moments)" in item(planned, "moments of later orders").size
     assert "four moments" not in item(made(), "moments of order 1").reason
 
