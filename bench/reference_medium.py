@@ -7,7 +7,7 @@
 Each line is one atmosphere: number of rays, rms of z = (difference) / (both standard errors), largest abs(z), and the
 bias: the mean relative difference, weighted by 1 / variance, with its standard error. Rays of which too few paths
 bring any light for their own standard error to be known are left out and counted (a view of black ground from 1 m
-needs 10^6 paths for one).
+needs 10^6 paths for one, and with few their scatter says nothing of the error).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from . import reference
 
-LEAST_HITS = 100
+LEAST_HITS = 1000
 # The quadrature behind single scattering is exact for our purposes; what is allowed for our own float32.
 SINGLE_SIGMA = 1e-4
 

@@ -57,12 +57,14 @@ def levels(atmosphere: Atmosphere) -> np.ndarray:
 @dataclass
 class Flight:
     """A straight way through the air: altitude ``h`` (m) and zenith cosine ``mu`` where it begins, ``start`` (m from
-    the ray's origin) and ``length`` (m, 0 where there is no air on the ray)."""
+    the ray's origin) and ``length`` (m, 0 where there is no air on the ray); ``shadowed``: the planet is between the
+    two ends, for a ray that is to reach beyond it."""
 
     h: Any
     mu: Any
     start: Any
     length: Any
+    shadowed: Any
 
 
 @dataclass
@@ -96,7 +98,10 @@ def flight(air: Air, ray: Any, reach: Any) -> Flight:
     down = ~under & hits_ground(radius, h_in, mu)
     end = dr.select(down, distance_down(radius, h_in, mu, 0.0), far - near)
     length = dr.minimum(end, reach * (1.0 / air.scale) - near)
-    return Flight(h_in, mu, near, dr.select(exists, dr.maximum(length, 0.0), 0.0))
+    # Shapes that stand for the ground lie a little below altitude 0 (:mod:`.planet`): a beam of the sun that grazes the
+    # ground would pass between.
+    shadowed = hits & (down | (under & (r_mu <= 0.0))) & (reach * (1.0 / air.scale) > 2.0 * radius)
+    return Flight(h_in, mu, near, dr.select(exists, dr.maximum(length, 0.0), 0.0), shadowed)
 
 
 class Airway:

@@ -112,7 +112,7 @@ class AtmosphereVolpath:
             chance = scene.pdf_emitter_direction(last, ds, shines & ~alone)
             share = dr.select(alone, 1.0, mis_weight(last_pdf, chance))
             emitted = unpolarized(emitter.eval(si, shines))
-            result += dr.select(shines, worth * fly.transmittance * emitted * share, 0.0)
+            result += dr.select(shines & ~f.shadowed, worth * fly.transmittance * emitted * share, 0.0)
 
             # Scatter in the air or fly on to the surface.
             active &= depth + 1 < most
@@ -147,7 +147,9 @@ class AtmosphereVolpath:
             connects &= (ds.pdf > 0.0) & dr.isfinite(ds.pdf) & dr.isfinite(dr.sum(unpolarized(light)))
             toward = point.spawn_ray_to(ds.p)
             connects &= ~scene.ray_test(toward, connects)
-            between = way.transmittance(flight(air, toward, dr.select(connects, toward.maxt, 0.0)))
+            beam = flight(air, toward, dr.select(connects, toward.maxt, 0.0))
+            connects &= ~beam.shadowed
+            between = way.transmittance(beam)
             phase_value, phase_pdf = phase.eval_pdf(context, mei, ds.d, in_air & connects)
             bsdf_value, bsdf_pdf = bsdf.eval_pdf(bsdf_context, si, si.to_local(ds.d), smooth & connects)
             value = dr.select(in_air, unpolarized(phase_value), unpolarized(bsdf_value))
