@@ -109,7 +109,8 @@ def command(
 
     with _mitsuba(variant):
         loaded = _load(path, parameters, width, height, reference)
-        passes = Passes(loaded, spp, REFERENCE_PASS_SAMPLES if reference else PASS_SAMPLES)
+        most = REFERENCE_PASS_SAMPLES if reference else PASS_SAMPLES
+        passes = Passes(loaded, spp, most, scatter=standard_error)
         with progress_bar(f"rendering {path.stem}", quiet=quiet) as advance:
             written = started
             try:
@@ -163,10 +164,10 @@ class Passes:
 
     The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
     estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all;
-    ``seed``: of the first pass.
+    ``seed``: of the first pass. scatter: whether :meth:`standard_error` will be asked for, which takes memory.
     """
 
-    def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES) -> None:
+    def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES, scatter: bool = True) -> None:
         self._scene, self._sensor = scene, scene.sensors()[0]
         self._film, self._sampler = self._sensor.film(), self._sensor.sampler()
         self.total = spp or self._sampler.sample_count()
@@ -175,7 +176,7 @@ class Passes:
             self._sizes = [self.total // 2, self.total - self.total // 2]
         # A film with more pixels than a pass may have samples is rendered in strips.
         self._strips = list(strips(*(int(n) for n in self._film.crop_size()), most))
-        self.samples, self.seed = 0, 0
+        self.samples, self.seed, self._scatter = 0, 0, scatter
         self._sums: np.ndarray | float = 0.0
         # Of the passes' own pictures x with n samples each: sums of n x, n^2 x, n^2 x^2, n^2.
         self._moments: list[Any] = [0.0, 0.0, 0.0, 0.0]
@@ -186,10 +187,12 @@ class Passes:
         for seed, count in enumerate(self._sizes):
             raw = self._pass(self.seed + seed, count)
             taken = self._sampler.sample_count()
-            x = _developed(self._film, raw).pixels.astype(np.float64)
-            terms = (taken * x, taken**2 * x, taken**2 * x * x, float(taken**2))
-            self._moments = [total + term for total, term in zip(self._moments, terms, strict=True)]
-            self._sums = self._sums + raw
+            if self._scatter:
+                x = _developed(self._film, raw).pixels.astype(np.float64)
+                terms = (taken * x, taken**2 * x, taken**2 * x * x, float(taken**2))
+                self._moments = [total + term for total, term in zip(self._moments, terms, strict=True)]
+            raw += self._sums
+            self._sums = raw
             self.samples += taken
             done += count
             advance(done / self.total)
@@ -217,17 +220,20 @@ class Passes:
             parameters["film.crop_offset"] = mi.ScalarPoint2u(left, top + first)
             parameters.update()
 
-        parts = []
+        result: Any = None
         try:
             for number, (first, rows) in enumerate(self._strips):
                 # Samples beyond a strip count in it as far as the film's filter reaches.
                 begin, end = max(first - reach, 0), min(first + rows + reach, height)
                 crop(begin, end - begin)
                 # Seeds of a strip are those of the passes of no other one.
-                parts.append(taken(seed * len(self._strips) + number)[first - begin :][:rows])
+                part = taken(seed * len(self._strips) + number)[first - begin :][:rows]
+                if result is None:
+                    result = np.empty((height, *part.shape[1:]))
+                result[first : first + rows] = part
         finally:
             crop(0, height)
-        return np.concatenate(parts)
+        return result
 
     def picture(self) -> Picture:
         """The picture of the passes done."""
