@@ -39,9 +39,9 @@ class Picture:
 
     @property
     def rgb(self) -> np.ndarray:
-        """Linear sRGB float64 [height, width, 3]; a luminance picture is repeated into the three channels."""
+        """Linear sRGB float32 [height, width, 3]; a luminance picture is repeated into the three channels."""
         names = ("R", "G", "B") if "R" in self.channels else ("Y", "Y", "Y")
-        return self.pixels[..., [self.channels.index(name) for name in names]].astype(np.float64)
+        return self.pixels[..., [self.channels.index(name) for name in names]]
 
     @property
     def invalid(self) -> np.ndarray:
@@ -74,8 +74,18 @@ def display(rgb: np.ndarray, stops: float = 0.0) -> np.ndarray:
 
     stops: exposure around the automatic one, +1 doubles the light.
     """
+    rgb = np.asarray(rgb)
+    factor = automatic_exposure(rgb) * 2.0**stops
+    # A few rows at a time: in float64 a large picture takes many times its own memory.
+    pixels = rgb.reshape(-1, 3)
+    parts = np.array_split(pixels, len(pixels) // 2**18 + 1)
+    return np.concatenate([_compressed(part.astype(np.float64), factor) for part in parts]).reshape(rgb.shape)
+
+
+def _compressed(rgb: np.ndarray, factor: float) -> np.ndarray:
+    """:func:`display` at a given exposure, float32."""
     invalid = ~np.isfinite(rgb).all(axis=-1, keepdims=True)
-    exposed = np.where(invalid, 0.0, rgb) * (automatic_exposure(rgb) * 2.0**stops)
+    exposed = np.where(invalid, 0.0, rgb) * factor
     before = luminance(exposed)[..., None]
     after = -np.expm1(-np.maximum(before, 0.0))
     scale = np.divide(after, before, out=np.ones_like(before), where=before > 0.0)
@@ -84,7 +94,7 @@ def display(rgb: np.ndarray, stops: float = 0.0) -> np.ndarray:
     room = np.where(away > 0.0, 1.0 - after, after)
     reach = np.divide(room, np.abs(away), out=np.full_like(away, np.inf), where=np.abs(away) > room)
     shown = after + away * np.minimum(reach.min(axis=-1, keepdims=True), 1.0)
-    return np.where(invalid, INVALID_COLOUR, np.clip(shown, 0.0, 1.0))
+    return np.where(invalid, INVALID_COLOUR, np.clip(shown, 0.0, 1.0)).astype(np.float32)
 
 
 def write_png(path: str | Path, rgb: np.ndarray) -> None:

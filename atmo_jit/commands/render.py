@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from atmo_jit import __version__, scenes
 from atmo_jit.errors import InputError, one_line
 from atmo_jit.files import atomic_outputs, check_output
-from atmo_jit.image import Picture, display, luminance, write_exr, write_png
+from atmo_jit.image import Picture, display, write_exr, write_png
+from atmo_jit.interrupts import deferred_interrupts
+from atmo_jit.passes import PASS_SAMPLES, REFERENCE_PASS_SAMPLES, Passes
 from atmo_jit.progress import progress_bar
 
-# Camera samples of one pass: bounds the memory (about 0.1 KiB each) and keeps the bar moving on small machines.
-PASS_SAMPLES = 2**21
-# The same for the path-traced medium, whose samples need more memory.
-REFERENCE_PASS_SAMPLES = 2**19
 # Seconds between the pictures that a --reference render leaves on the way.
 KEEP_SECONDS = 20.0
-# A picture takes at least this many passes where it has the samples for it, so that the bar moves.
-LEAST_PASSES = 16
 
 
 @click.command()
@@ -113,16 +107,15 @@ def command(
         passes = Passes(loaded, spp, most, scatter=standard_error)
         with progress_bar(f"rendering {path.stem}", quiet=quiet) as advance:
             written = started
-            try:
+            with deferred_interrupts() if reference else nullcontext() as interrupt:
                 for _ in passes.run(advance):
+                    if interrupt and interrupt.asked and passes.samples < passes.total:
+                        write(passes)
+                        _warn(f"interrupted: {exr.name} holds {passes.samples} of {passes.total} samples per pixel")
+                        raise KeyboardInterrupt
                     if reference and time.perf_counter() - written > KEEP_SECONDS:
                         write(passes)
                         written = time.perf_counter()
-            except KeyboardInterrupt:
-                if reference and passes.samples:
-                    write(passes)
-                    _warn(f"interrupted: {exr.name} holds {passes.samples} of {passes.total} samples per pixel")
-                raise
         picture = write(passes)
     invalid = int(picture.invalid.sum())
     if invalid:
@@ -144,148 +137,6 @@ def _load(path: Path, parameters: dict[str, str], width: int | None, height: int
     from atmo_jit.plugins.reference import load_reference
 
     return load_reference(lambda edit: load_scene(path, parameters, width=width, height=height, edit=edit))
-
-
-def render_picture(scene: Any, spp: int | None, advance: Callable[[float], None]) -> tuple[Picture, int]:
-    """Render with the scene's integrator and first sensor, in passes of different seeds, and return it with its spp.
-
-    spp: samples per pixel, None for the sensor's own number. Samplers that cannot take a number take the next larger
-        one; the second result is the number really used.
-    advance: called with the fraction done after every pass.
-    """
-    passes = Passes(scene, spp)
-    for _ in passes.run(advance):
-        continue
-    return passes.picture(), passes.samples
-
-
-class Passes:
-    """A picture in passes of different seeds, with the scene's integrator and first sensor.
-
-    The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
-    estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all;
-    ``seed``: of the first pass. scatter: whether :meth:`standard_error` will be asked for, which takes memory.
-    """
-
-    def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES, scatter: bool = True) -> None:
-        self._scene, self._sensor = scene, scene.sensors()[0]
-        self._film, self._sampler = self._sensor.film(), self._sensor.sampler()
-        self.total = spp or self._sampler.sample_count()
-        self._sizes = list(pass_sizes(self.total, int(np.prod(self._film.crop_size())), most))
-        if len(self._sizes) == 1 and self.total > 1:  # one pass knows no standard error
-            self._sizes = [self.total // 2, self.total - self.total // 2]
-        # A film with more pixels than a pass may have samples is rendered in strips.
-        self._strips = list(strips(*(int(n) for n in self._film.crop_size()), most))
-        self.samples, self.seed, self._scatter = 0, 0, scatter
-        self._sums: np.ndarray | float = 0.0
-        # Of the passes' own pictures x with n samples each: sums of n x, n^2 x, n^2 x^2, n^2.
-        self._moments: list[Any] = [0.0, 0.0, 0.0, 0.0]
-
-    def run(self, advance: Callable[[float], None]) -> Iterator[None]:
-        """Render, one pass at each step; ``advance`` is called with the fraction done."""
-        done = 0
-        for seed, count in enumerate(self._sizes):
-            raw = self._pass(self.seed + seed, count)
-            taken = self._sampler.sample_count()
-            if self._scatter:
-                x = _developed(self._film, raw).pixels.astype(np.float64)
-                terms = (taken * x, taken**2 * x, taken**2 * x * x, float(taken**2))
-                self._moments = [total + term for total, term in zip(self._moments, terms, strict=True)]
-            raw += self._sums
-            self._sums = raw
-            self.samples += taken
-            done += count
-            advance(done / self.total)
-            yield
-
-    def _pass(self, seed: int, count: int) -> np.ndarray:
-        """The film's weighted sums after ``count`` samples per pixel, float64."""
-        integrator = self._scene.integrator()
-
-        def taken(number: int) -> np.ndarray:
-            integrator.render(self._scene, self._sensor, seed=number, spp=count, develop=False, evaluate=True)
-            return np.array(self._film.develop(raw=True), dtype=np.float64)
-
-        if len(self._strips) == 1:
-            return taken(seed)
-        import mitsuba as mi
-
-        width, height = (int(v) for v in self._film.crop_size())
-        left, top = (int(v) for v in self._film.crop_offset())
-        reach = math.ceil(self._film.rfilter().radius())
-
-        def crop(first: int, rows: int) -> None:
-            parameters = mi.traverse(self._sensor)
-            parameters["film.crop_size"] = mi.ScalarVector2u(width, rows)
-            parameters["film.crop_offset"] = mi.ScalarPoint2u(left, top + first)
-            parameters.update()
-
-        result: Any = None
-        try:
-            for number, (first, rows) in enumerate(self._strips):
-                # Samples beyond a strip count in it as far as the film's filter reaches.
-                begin, end = max(first - reach, 0), min(first + rows + reach, height)
-                crop(begin, end - begin)
-                # Seeds of a strip are those of the passes of no other one.
-                part = taken(seed * len(self._strips) + number)[first - begin :][:rows]
-                if result is None:
-                    result = np.empty((height, *part.shape[1:]))
-                result[first : first + rows] = part
-        finally:
-            crop(0, height)
-        return result
-
-    def picture(self) -> Picture:
-        """The picture of the passes done."""
-        return _developed(self._film, self._sums)
-
-    def standard_error(self) -> Picture:
-        """The standard error of :meth:`picture`, from the scatter of the passes; NaN after the first."""
-        first, weighted, squares, weights = self._moments
-        mean = first / self.samples
-        passes = min(len(self._sizes), max(1, round(self.samples / self._sizes[0])))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            spread = (squares - 2.0 * mean * weighted + mean * mean * weights) / self.samples**2
-            error = np.sqrt(np.maximum(spread, 0.0) * passes / (passes - 1.0))
-        return Picture(error.astype(np.float32), self.picture().channels)
-
-
-def pass_sizes(spp: int, pixels: int, limit: int = PASS_SAMPLES) -> Iterator[int]:
-    """Samples per pixel of each pass: powers of two, so that all passes of one picture share a compiled kernel.
-
-    limit: camera samples of one pass.
-    """
-    most = max(1, min(spp // LEAST_PASSES, limit // pixels))
-    size = 1 << (most.bit_length() - 1)
-    if spp >= 4:
-        size = max(size, 4) if 4 * pixels <= limit else size
-    while spp:
-        while size > spp:
-            size //= 2
-        yield size
-        spp -= size
-
-
-def strips(width: int, height: int, limit: int) -> Iterator[tuple[int, int]]:
-    """First row and number of rows of the parts of a film that have at most ``limit`` pixels each (or one row)."""
-    rows = max(1, limit // width)
-    for first in range(0, height, rows):
-        yield first, min(rows, height - first)
-
-
-def _developed(film: Any, sums: np.ndarray) -> Picture:
-    """A film's weighted sums over its weights: red, green, blue or luminance, alpha, then the integrator's extras."""
-    names = [field.name for field in film.bitmap(raw=True).struct_()]
-    if "W" not in names or "R" not in names:
-        raise InputError(f"the scene's film gives the channels {', '.join(names)}; must be an hdrfilm")
-    weight = sums[..., names.index("W"), None]
-    values = np.divide(sums, weight, out=np.zeros_like(sums), where=weight != 0.0)
-    planes = {name: values[..., index] for index, name in enumerate(names) if name != "W"}
-    developed = [field.name for field in film.bitmap().struct_()]
-    if developed[0] == "Y":
-        grey = luminance(np.stack([planes.pop(name) for name in "RGB"], axis=-1))
-        planes = {"Y": grey, **planes}
-    return Picture(np.stack(list(planes.values()), axis=-1).astype(np.float32), tuple(planes))
 
 
 def _parameters(definitions: tuple[str, ...]) -> dict[str, str]:

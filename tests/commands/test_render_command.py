@@ -14,6 +14,7 @@ import pytest
 from atmo_jit import scenes
 from atmo_jit.cli import main
 from atmo_jit.commands import render
+from atmo_jit.passes import Passes
 
 mi = pytest.importorskip("mitsuba")
 
@@ -128,37 +129,15 @@ def test_extra_channels_of_the_integrator_are_kept(run, scene, tmp_path):
     assert read_png(tmp_path / "x.png").shape == (8, 16, 3)
 
 
-def test_passes_add_up_to_one_estimate(scene):
-    mi.set_variant("llvm_ad_rgb")
-    loaded = mi.load_file(str(scene))
-    seen = []
-    picture, samples = render.render_picture(loaded, 64, seen.append)
-    reference = np.array(mi.render(loaded, spp=4096, seed=9))
-    assert samples == 64 and seen[-1] == 1.0 and seen == sorted(seen) and len(seen) == 16
-    error = picture.rgb - reference
-    assert abs(error).max() < 0.3
-    assert abs(error.mean()) < 0.01
-
-
-def test_pass_sizes():
-    for spp in (1, 3, 4, 7, 64, 100, 1000, 4096):
-        for pixels in (1, 640 * 360, 10**7):
-            sizes = list(render.pass_sizes(spp, pixels))
-            assert sum(sizes) == spp
-            assert all(size & (size - 1) == 0 for size in sizes)
-            assert max(sizes) == 1 or max(sizes) * pixels <= render.PASS_SAMPLES
-    assert list(render.pass_sizes(64, 640 * 360)) == [4] * 16
-
-
 def test_invalid_pixels_are_reported_and_painted(run, scene, tmp_path, monkeypatch):
-    developed = render._developed
+    developed = Passes.picture
 
-    def spoiled(film, sums):
-        picture = developed(film, sums)
+    def spoiled(passes):
+        picture = developed(passes)
         picture.pixels[2, 3, 1], picture.pixels[2, 4, 0] = np.nan, np.inf
         return picture
 
-    monkeypatch.setattr(render, "_developed", spoiled)
+    monkeypatch.setattr(Passes, "picture", spoiled)
     status, _, err = run(scene, "--out", tmp_path / "x.exr", "--quiet")
     assert status == 0
     assert err == "atmo-jit: warning: 2 of 128 pixels are NaN or infinite: kept in x.exr, magenta in x.png\n"
@@ -282,30 +261,3 @@ def on_a_terminal(command):
     os.close(terminal)
     assert process.wait() == 0
     return text.decode()
-
-
-def test_strips_cover_the_film():
-    for width, height, limit in ((3840, 2160, 2**19), (7, 5, 1), (640, 360, 2**21), (10, 9, 25)):
-        parts = list(render.strips(width, height, limit))
-        assert [first for first, _ in parts] == list(np.cumsum([0, *(rows for _, rows in parts)])[:-1])
-        assert sum(rows for _, rows in parts) == height
-        assert all(rows * width <= limit or rows == 1 for _, rows in parts)
-
-
-def test_large_films_are_rendered_in_strips(monkeypatch):
-    """The same picture, within its noise, whether a pass is of the whole film or of a few rows; the film is left as it
-    was.
-    """
-    with render._mitsuba("llvm_ad_rgb"):
-        scene = render._load(scenes.find("ball"), {}, 24, 14, False)
-        pictures, errors = [], []
-        for most in (2**21, 24 * 4):
-            passes = render.Passes(scene, 64, most)
-            for _ in passes.run(lambda fraction: None):
-                continue
-            pictures.append(passes.picture().pixels[..., :3])
-            errors.append(passes.standard_error().pixels[..., :3])
-            assert tuple(scene.sensors()[0].film().crop_size()) == (24, 14)
-    difference, sigma = pictures[0] - pictures[1], np.hypot(*errors)
-    assert pictures[0].shape == pictures[1].shape == (14, 24, 3)
-    assert np.sqrt(np.mean((difference / np.maximum(sigma, 1e-3 * pictures[0])) ** 2)) < 1.5

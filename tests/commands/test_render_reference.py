@@ -47,24 +47,6 @@ def test_same_picture_as_the_emitter(tmp_path):
     assert np.all(np.abs(blocks(traced) - blocks(tables)) < 4.0 * sigma + 0.01 * blocks(tables))
 
 
-def test_standard_error_is_the_scatter_of_repeated_renders(tmp_path):
-    from atmo_jit.commands.render import Passes, _load, _mitsuba
-    from atmo_jit.scenes import find
-
-    with _mitsuba("llvm_ad_rgb"):
-        scene = _load(find("ball"), {}, 16, 9, True)
-        pictures, errors = [], []
-        for first in range(24):
-            passes = Passes(scene, 64)
-            passes.seed = 1000 * first
-            for _ in passes.run(lambda fraction: None):
-                continue
-            pictures.append(passes.picture().pixels)
-            errors.append(passes.standard_error().pixels)
-    ratio = np.std(pictures, axis=0, ddof=1).mean() / np.sqrt(np.mean(np.square(errors), axis=0)).mean()
-    assert 0.85 < ratio < 1.15
-
-
 def test_scene_without_the_emitter_is_refused(tmp_path, capsys):
     scene = tmp_path / "plain.xml"
     scene.write_text('<scene version="3.9.0"><integrator type="path"/><sensor type="perspective"/></scene>')

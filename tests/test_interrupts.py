@@ -1,0 +1,51 @@
+"""Signals that wait until the work at hand is whole."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from atmo_jit.interrupts import deferred_interrupts
+
+
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Jobs that a shell starts in the background ignore interrupts."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_waits_and_second_raises(number):
+    before = signal.getsignal(number)
+    with deferred_interrupts() as interrupt:
+        assert not interrupt.asked
+        os.kill(os.getpid(), number)
+        assert interrupt.asked
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is before
+
+
+def test_ignored_signals_stay_ignored():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with deferred_interrupts() as interrupt:
+        os.kill(os.getpid(), signal.SIGINT)
+    assert not interrupt.asked
+
+
+def test_other_threads_just_run():
+    seen = []
+
+    def work():
+        with deferred_interrupts() as interrupt:
+            seen.append(interrupt.asked)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [False]
