@@ -22,7 +22,7 @@ import numpy as np
 
 from . import reference
 
-BATCH = 2**17
+BATCH = 2**15
 DEPTH = {"max_depth": 1000, "rr_depth": 1000}
 CAPSULE_M = 0.5
 STEP = 0.02  # of the single-scattering albedo, for the difference quotient
