@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, types
+from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, tables_of, types
 from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
@@ -122,7 +122,7 @@ def beam_along(
     for mu in turned(end):
         ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, beam.at(t.UInt(0), mu), strict=True)]
     scattered = [value for part in sums for value in part] or [t.Float(0.0)]
-    return table_of(scattered, lane), table_of(ground, lane)
+    return tuple(tables_of([scattered, ground], lane))
 
 
 def _suns(grid: Grid) -> Any:
@@ -170,7 +170,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((degree + 1) * channels)]
     end = dr.opaque(t.UInt, azimuths, 1)
     _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="phases")
-    return stored_harmonics(sums, azimuths)
+    return stored_harmonics(sums, channels, azimuths)
 
 
 def _dot(a: list[Any], b: list[Any]) -> Any:

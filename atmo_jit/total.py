@@ -63,7 +63,7 @@ def _sum(
     entry, node = place % entries, place // entries
     sun, k = node % suns, node // suns
     total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
-    total = total * dr.gather(t.Float, reference.inverse, node * channels + channel)
+    total = total * dr.gather(t.Float, reference.inverse, node * row_size(channels) + channel)
     if rest:
         later = _rest(grid, reference, first, rest, shares, start, entries, peaks)
         taps = Taps(grid, t.Float(sun) / grid.first, few)
@@ -127,6 +127,7 @@ def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: in
     lane = dr.arange(t.UInt, (order.degree + 1) * altitudes * suns * channels)
     channel, node = lane % channels, lane // channels
     sun, node = node % suns, node // suns
+    sun = dr.maximum(sun, int(grid.whole_suns))  # under the zenith light has m = 0 alone: the next sun's ratio holds
     k, l_ = node % altitudes, node // altitudes
     product, square = 0.0, 0.0
     for m in range(min(order.most, 1), order.most + 1):
