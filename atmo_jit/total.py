@@ -150,8 +150,8 @@ def _peak(grid: Grid, first: Moments, order: Moments) -> Any:
 
 
 def _degrees(grid: Grid, degree: int) -> Any:
-    """l of every pair."""
-    return grid.kept(("degrees", degree), lambda: uints(pairs(degree)[0]))
+    """l of every pair, and 0 for the irradiance."""
+    return grid.kept(("degrees", degree), lambda: uints(np.append(pairs(degree)[0], 0)))
 
 
 def _places(grid: Grid, light: Moments, lower: Moments) -> Any:
