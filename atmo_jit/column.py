@@ -89,7 +89,7 @@ class SunColumns:
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
-        whole = self._rising(lowest, types().Float(0.0), sinks)
+        whole = self._rising(lowest, None, sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
     def upward(self, h: Any) -> list[Any]:
@@ -97,6 +97,7 @@ class SunColumns:
         return self._rising(h, types().Float(1.0), True) if self._count else []
 
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
+        """Columns to the top from ``h`` along mu >= 0; None: horizontally."""
         t = types()
         cosines = self._cosines
         position = dr.sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
@@ -109,17 +110,21 @@ class SunColumns:
         start = t.Float(below)
         by_root = y - start
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
-        x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
-        column = dr.minimum(t.UInt(x), cosines - 2)
-        fx = x - t.Float(column)
-        corner = dr.fma(shell, self._rows + 1, below) * cosines + column
-        n = self._count
-        a, b, c, d = (row(self._table, corner + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1))
-        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
+        corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
+        if mu is None:
+            near, far = (row(self._table, corner + offset, n, active=active) for offset in (0, cosines))
+        else:
+            x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
+            column = dr.minimum(t.UInt(x), cosines - 2)
+            fx = x - t.Float(column)
+            a, b, c, d = (
+                row(self._table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
+            )
+            near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
+        path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)
         result = []
         for k in range(n):
-            fy = by_altitude if self._logarithmic[k] else by_root
-            mean = dr.lerp(dr.lerp(a[k], b[k], fx), dr.lerp(c[k], d[k], fx), fy)
+            mean = dr.lerp(near[k], far[k], by_altitude if self._logarithmic[k] else by_root)
             result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
         return result
 
