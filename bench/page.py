@@ -35,8 +35,8 @@ On a horizontal surface. The sky's reference is itself 0.2-1.6 % too bright: its
 ORDERS = """## All orders
 
 711 rays in 17 atmospheres against spherical backward Monte Carlo (double precision; its own noise, one sigma,
-has a median of 0.08 %). The 95th percentile and the maximum are of what exceeds three sigma. "Within 1 %" is the part of the rays whose error is below 1 % plus three sigma;
-"rms/sigma" is the rms error in units of the reference's noise.
+has a median of 0.08 %). The 95th percentile and the maximum are of what exceeds three sigma. "Within 1 %" is the part
+of the rays whose error is below 1 % plus three sigma; "rms/sigma" is the rms error in units of the reference's noise.
 """
 
 
