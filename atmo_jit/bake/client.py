@@ -124,60 +124,87 @@ def _views(to: Bruneton, altitudes: int, rows: int) -> tuple[np.ndarray, np.ndar
     return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (altitudes, rows))), ground
 
 
-def _scattering(band: Any, to: Bruneton, size: tuple[int, int, int, int], mie_weight: Any) -> list[np.ndarray]:
+def _scattering(
+    band: Any, to: Bruneton, size: tuple[int, int, int, int], mie_weight: Callable[[int, np.ndarray], np.ndarray] | None
+) -> list[np.ndarray]:
     """Rayleigh, Mie and higher orders of one band, [altitude, row, angle, sun, C]."""
     altitudes, rows, angles, suns = size
-    optics, mu_s = band.optics, to.sun_inverse(texels(suns))
-    h, mu, ground = _views(to, altitudes, rows)
+    views = _views(to, altitudes, rows)
+
+    def angle(index: Any, view: Any, cosine: Any) -> Any:
+        return to.angle_inverse(types().Float(index) / (angles - 1.0), view, cosine)
+
+    weight = None
+    if mie_weight is not None:
+        nu = scattering_nodes(to, size)[3]
+
+        def weight(species: int) -> np.ndarray:
+            return mie_weight(species, nu)[..., band.optics.indices].astype(np.float32)
+
+    return scattered_light(band, views, to.sun_inverse(texels(suns)), angle, angles, weight)
+
+
+def scattered_light(
+    band: Any,
+    views: tuple[np.ndarray, np.ndarray, np.ndarray],
+    mu_s: np.ndarray,
+    angle: Callable[[Any, Any, Any], Any],
+    angles: int,
+    mie_weight: Callable[[int], np.ndarray] | None = None,
+) -> list[np.ndarray]:
+    """Single scattering by air and by all aerosols, without phase functions, and orders >= 2 of one band, each
+    [A, V, angles, suns, C].
+
+    ``views``: h [A] (m), mu [A, V] and whether the ray ends on the ground [V] or [A, V]; ``mu_s``: ascending [suns];
+    ``angle(index, mu, mu_s)``: nu on Dr.Jit arrays; ``mie_weight(species)``: a factor to single scattering by it.
+    """
+    optics, (h, mu, ground) = band.optics, views
+    ground = np.broadcast_to(ground, mu.shape)
+    size = (*mu.shape, angles, len(mu_s))
     sunlight = Sunlight(optics, band.columns)
     # The planet's shadow lies across the rays of low suns, and takes a finer quadrature.
     low = int(np.count_nonzero(mu_s < TWILIGHT))
     parts, lines = [], None
-    for some, nodes in ((slice(0, low), TWILIGHT_NODES), (slice(low, suns), DAY_NODES)):
-        if some.start == some.stop:
+    for some, nodes in ((slice(0, low), TWILIGHT_NODES), (slice(low, None), DAY_NODES)):
+        if not len(mu_s[some]):
             continue
-        where = np.repeat(h, rows), mu.ravel()
-        lines = Sightlines(optics, *where, ground=np.tile(ground, altitudes), nodes=nodes)
-        lanes = _Lanes(to, mu, mu_s[some], angles)
+        lines = Sightlines(optics, np.repeat(h, mu.shape[1]), mu.ravel(), ground=ground.ravel(), nodes=nodes)
+        lanes = _Lanes(mu, mu_s[some], angle, angles)
         single = lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu)
-        shape = (altitudes, rows, angles, len(mu_s[some]))
-        parts.append([_stacked(light, shape) for light in single])
+        parts.append([_stacked(light, (*size[:3], len(mu_s[some]))) for light in single])
     rayleigh = mie = np.zeros((*size, optics.channel_count), dtype=np.float32)
     species = [c.name for c in optics.atmosphere.mie]
     for k, *light in zip(optics.scatterers, *parts, strict=True):
         name, whole = optics.constituents[k].name, np.concatenate(light, axis=3)
         if name == "rayleigh":
             rayleigh = whole
-        elif mie_weight is None:
-            mie = mie + whole
         else:
-            nu = scattering_nodes(to, size)[3]
-            mie = mie + whole * mie_weight(species.index(name), nu)[..., optics.indices].astype(np.float32)
+            mie = mie + (whole if mie_weight is None else whole * mie_weight(species.index(name)))
     if band.source is None:
         return [rayleigh, mie, np.zeros_like(rayleigh)]
-    whole = lines.scattering.reshape(altitudes, rows, *lines.scattering.shape[1:])
-    edge, end = view_range(to.bottom, to.top - to.bottom, h[:, None])
+    whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
+    edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
     x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
     series = Series(MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
-    lanes = _Lanes(to, mu, mu_s, angles)
-    higher = series.at(lanes.ray * suns + lanes.sun, lanes.cos_phi)
+    lanes = _Lanes(mu, mu_s, angle, angles)
+    higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
     dr.eval(higher)
     # Polynomials swing about 0 where no light is left.
     return [rayleigh, mie, np.maximum(_stacked(higher, size), 0.0)]
 
 
 class _Lanes:
-    """The texels of some suns, [altitude, row, angle, sun] flattened, as Dr.Jit arrays: indices of ``ray`` and ``sun``,
-    sun ``cosine``, ``across`` = sin(sun zenith) cos(azimuth from the sun), ``cos_phi``, ``nu``."""
+    """All combinations [altitude, row, angle, sun], flattened, as Dr.Jit arrays: indices of ``ray`` and ``sun``, sun
+    ``cosine``, ``across`` = sin(sun zenith) cos(azimuth from the sun), ``cos_phi``, ``nu``."""
 
-    def __init__(self, to: Bruneton, mu: np.ndarray, mu_s: np.ndarray, angles: int) -> None:
+    def __init__(self, mu: np.ndarray, mu_s: np.ndarray, angle: Callable[[Any, Any, Any], Any], angles: int) -> None:
         t = types()
         lane = dr.arange(t.UInt, mu.size * angles * len(mu_s))
         self.sun, rest = lane % len(mu_s), lane // len(mu_s)
         self.ray = rest // angles
         self.cosine = dr.gather(t.Float, floats(mu_s), self.sun)
         view = dr.gather(t.Float, floats(mu), self.ray)
-        self.nu = to.angle_inverse(t.Float(rest % angles) / (angles - 1.0), view, self.cosine)
+        self.nu = angle(rest % angles, view, self.cosine)
         sine, sin_s = (dr.sqrt((1.0 - c) * (1.0 + c)) for c in (view, self.cosine))
         self.across = dr.clip((self.nu - view * self.cosine) / dr.maximum(sine, 1e-9), -sin_s, sin_s)
         self.cos_phi = dr.clip(self.across / dr.maximum(sin_s, 1e-9), -1.0, 1.0)

@@ -68,7 +68,7 @@ class MeanSource:
         """Cosine series in azimuth of the radiance along rays, float32 [A, V, S, azimuthal order, C].
 
         ``h`` [A] (m); ``x`` [A, V]: place between the horizon (0) and zenith or nadir (1) as in :func:`view_cosines`,
-        ``up`` [V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
+        ``up`` [V] or [A, V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
         """
         values = np.moveaxis(self.harmonics, 4, 0)  # scatterers apart
         kinds, a, v, *rest = values.shape
@@ -77,8 +77,9 @@ class MeanSource:
             place = chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0)))
             values = np.stack([np.tensordot(place.astype(np.float32), kind, 1) for kind in values])
         matrix = np.zeros((*x.shape, v), dtype=np.float32)
+        up = np.broadcast_to(up, x.shape)
         for half, nodes in ((up, slice(0, self.up)), (~up, slice(self.up, v))):
-            matrix[:, half, nodes] = chebyshev_matrix(nodes.stop - nodes.start, x[:, half])
+            matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
         total = np.zeros((*x.shape, *rest), dtype=np.float32)
         for k, kind in enumerate(values):
             mean = (matrix @ kind).reshape(*x.shape, *rest)

@@ -4,7 +4,7 @@
 >>> report = export("earth", "takram", "tables")
 
 Modules: :mod:`.exporter` (all layouts), :mod:`.takram`, :mod:`.bruneton`, :mod:`.cosmoscout` (clients of Bruneton's
-tables, :mod:`.family`); :mod:`.reader` (back from files),
+tables, :mod:`.family`), :mod:`.hillaire`, :mod:`.power3d`, :mod:`.native`; :mod:`.reader` (back from files),
 :mod:`.lookup` (how clients read them, in NumPy) and :mod:`.shaders` (the same as GLSL and HLSL).
 """
 

@@ -185,6 +185,6 @@ def halved(name: str, values: np.ndarray, warnings: list[str]) -> np.ndarray:
     if small > 1e-3:
         warnings.append(
             f"{name}: {100.0 * small:.1f} % of its positive values are below {SMALLEST_HALF:g}, where half precision "
-            "loses digits (deep twilight)"
+            "loses digits (deep twilight, short rays)"
         )
     return values.astype(np.float16)

@@ -19,7 +19,7 @@ from ..atmosphere import Atmosphere
 from ..errors import InputError
 from .containers import document, write_all
 
-LAYOUTS = ("takram", "bruneton", "cosmoscout")
+LAYOUTS = ("takram", "bruneton", "cosmoscout", "hillaire", "power3d", "native")
 PRECISIONS = ("half", "float")
 
 
@@ -125,3 +125,10 @@ def only(layout: str, name: str, value: Any, allowed: Sequence[Any], reason: str
         choices = ["x".join(map(str, v)) if isinstance(v, tuple) else str(v) for v in allowed]
         raise InputError(f"{name}: is {found}; {layout} allows {', '.join(choices)} ({reason})")
     return value
+
+
+def refuse(layout: str, options: Options, names: Sequence[str]) -> None:
+    """Raise InputError for options that the layout does not have."""
+    for name in names:
+        if getattr(options, name) is not None:
+            raise InputError(f"{name}: is {getattr(options, name)}; the layout {layout} has no such choice")

@@ -44,11 +44,11 @@ class ClientTables:
     def transmittance_up(self, h: Any, mu: Any) -> np.ndarray:
         """Transmittance to the top [..., 3] of rays (h, mu) that miss the ground."""
         x_r, x_mu = self.mapping.transmittance(np.asarray(h, float), np.asarray(mu, float))
-        return _linear(self.transmittance, x_r, x_mu)
+        return linear(self.transmittance, x_r, x_mu)
 
     def irradiance_on_ground(self, h: Any, mu_s: Any) -> np.ndarray:
         """Irradiance of the sky on a horizontal surface at ``h`` [..., 3]."""
-        return _linear(self.irradiance, *self.mapping.irradiance(np.asarray(h, float), np.asarray(mu_s, float)))
+        return linear(self.irradiance, *self.mapping.irradiance(np.asarray(h, float), np.asarray(mu_s, float)))
 
     def radiance(self, h: Any, mu: Any, mu_s: Any, nu: Any, ground: Any = None) -> np.ndarray:
         """Radiance [..., 3] scattered toward (h, mu); the ground's own is not in it. ``ground``: whether the rays end
@@ -61,8 +61,8 @@ class ClientTables:
         # The row's texture coordinate, back among texel centres: its two halves meet between two of them.
         row = self.mapping.view_row(self.mapping.view(h, mu, ground), ground, rows) * rows - 0.5
         place = (x_r, row / (rows - 1), self.mapping.angle(nu), self.mapping.sun(mu_s))
-        air = _linear(self.scattering, *place) * RayleighPhase().value(nu)[..., None]
-        return air + _linear(self.single_mie, *place) * CornetteShanks(self.g).value(nu)[..., None]
+        air = linear(self.scattering, *place) * RayleighPhase().value(nu)[..., None]
+        return air + linear(self.single_mie, *place) * CornetteShanks(self.g).value(nu)[..., None]
 
     def rays(self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any) -> np.ndarray:
         """The same for views (m, rad) from anywhere: those from above the air start where they enter it."""
@@ -83,7 +83,7 @@ class ClientTables:
         return np.where(meets[..., None], found, 0.0)
 
 
-def _linear(table: np.ndarray, *unit: np.ndarray) -> np.ndarray:
+def linear(table: np.ndarray, *unit: np.ndarray) -> np.ndarray:
     """``table`` [n0, n1, ..., C] read linearly at unit coordinates, held beyond the ends."""
     axes, total = len(unit), 0.0
     places = [np.clip(x, 0.0, 1.0) * (n - 1) for x, n in zip(unit, table.shape, strict=False)]

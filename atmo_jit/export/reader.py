@@ -9,11 +9,12 @@ from typing import Any
 from .._json import read_json
 from ..errors import InputError
 
-READABLE = ("takram", "bruneton")
+READABLE = ("takram", "bruneton", "native")
 
 
 def read(folder: str | Path) -> Any:
-    """What a folder with a params.json holds: :class:`.lookup.ClientTables` for the layouts takram and bruneton.
+    """What a folder with a params.json holds: :class:`.lookup.ClientTables` for the layouts takram and bruneton, a
+    solved :class:`atmo_jit.Sky` for native.
 
     Raises InputError for folders that are incomplete or of another layout, and files of a wrong size.
     """
