@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from atmo_jit.errors import InputError, shown
-from atmo_jit.export import LAYOUTS, PRECISIONS, Options, export
+from atmo_jit.export import LAYOUTS, PRECISIONS, TEXELS, Options, export
 from atmo_jit.progress import progress_bar
 
 
@@ -24,6 +24,11 @@ from atmo_jit.progress import progress_bar
     type=click.Choice(["samples", "spectral"]),
     help="Channels: the atmosphere's three wavelengths, or linear sRGB from all of them.",
 )
+@click.option(
+    "--texels",
+    type=click.Choice(TEXELS),
+    help="exact: right at their centres (default); fitted: least error between the suns (takram and its like).",
+)
 @click.option("--tolerance", type=float, default=0.01, show_default=True, help="Relative error to aim for, in (0, 1).")
 @click.option("--orders", type=click.IntRange(min=1), help="Scattering and reflection events, as for atmo-jit sky.")
 @click.option("--altitude", "altitude_m", type=float, help="Observer of tables for one of them (hillaire), m.")
@@ -37,6 +42,7 @@ def command(
     size: str | None,
     precision: str | None,
     colour: str | None,
+    texels: str | None,
     tolerance: float,
     orders: int | None,
     altitude_m: float | None,
@@ -50,7 +56,7 @@ def command(
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {shown(str(out), 200)}: is not a folder")
-    options = Options(mu_s_min, _size(size), precision, colour, tolerance, orders, altitude_m, sun_zenith_deg)
+    options = Options(mu_s_min, _size(size), precision, colour, tolerance, orders, altitude_m, sun_zenith_deg, texels)
     with progress_bar("export", quiet=quiet) as advance:
         report = export(atmosphere, layout, out, options, advance)
     for warning in report.warnings:

@@ -10,7 +10,7 @@ tables, :mod:`.family`), :mod:`.hillaire`, :mod:`.power3d`, :mod:`.native`; :mod
 
 from __future__ import annotations
 
-from .exporter import LAYOUTS, PRECISIONS, Options, Report, export
+from .exporter import LAYOUTS, PRECISIONS, TEXELS, Options, Report, export
 from .reader import read
 
-__all__ = ["LAYOUTS", "PRECISIONS", "Options", "Report", "export", "read"]
+__all__ = ["LAYOUTS", "PRECISIONS", "TEXELS", "Options", "Report", "export", "read"]

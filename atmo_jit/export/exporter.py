@@ -21,12 +21,14 @@ from .containers import document, write_all
 
 LAYOUTS = ("takram", "bruneton", "cosmoscout", "hillaire", "power3d", "native")
 PRECISIONS = ("half", "float")
+TEXELS = ("exact", "fitted")
 
 
 @dataclass(frozen=True)
 class Options:
     """What a layout lets one choose; None: what the layout has by default.
 
+    ``texels``: "exact" at their centres, or "fitted" to err least between the suns (see :mod:`.fitting`).
     ``mu_s_min``: cosine of the lowest sun of the scattering table. ``size``: texels of it. ``precision``: "half" or
     "float". ``colour``: "samples" or "spectral" (see :mod:`.colour`). ``tolerance``, ``orders``: of the solution, as
     for :class:`atmo_jit.Sky`. ``altitude_m``, ``sun_zenith_deg``: of tables for one observer and sun.
@@ -40,6 +42,7 @@ class Options:
     orders: int | None = None
     altitude_m: float | None = None
     sun_zenith_deg: float | None = None
+    texels: str | None = None
 
 
 @dataclass
@@ -86,6 +89,8 @@ def export(
     options = options or Options()
     if options.precision not in (None, *PRECISIONS):
         raise InputError(f"precision: is {options.precision!r}; must be one of {', '.join(PRECISIONS)}")
+    if options.texels not in (None, *TEXELS):
+        raise InputError(f"texels: is {options.texels!r}; must be one of {', '.join(TEXELS)}")
     air, clock = Atmosphere.load(atmosphere), Clock()
     if not air.constituents:
         raise InputError("atmosphere: has no constituents; an empty sky needs no tables")

@@ -21,6 +21,7 @@ from . import bruneton, cosmoscout, takram
 from .colour import Channels, channels, described
 from .containers import File, source
 from .exporter import Clock, Made, Options, only
+from .fitting import dense_size, fitted
 from .lookup import ClientTables
 from .parameters import Aerosol, aerosol, check_client, client_parameters, phase_ratio
 from .shaders import glsl, hlsl
@@ -67,7 +68,10 @@ def make(
     sky = Sky(air, options.orders, options.tolerance)
     clock.stage("solve")
     progress(0.2)
-    tables = client_tables(sky, colours, one, mu_s_min, size)
+    if options.texels == "fitted":
+        tables = fitted(client_tables(sky, colours, one, mu_s_min, dense_size(size)))
+    else:
+        tables = client_tables(sky, colours, one, mu_s_min, size)
     clock.stage("bake")
     progress(0.6)
     parameters = client_parameters(air, colours, mu_s_min, one.g)
@@ -129,6 +133,7 @@ def _metadata(
         "units": "cd m^-2 and lux" if layout == "cosmoscout" else "W m^-2 nm^-1, per sr where it is radiance",
         **described(colours, air),
         "muSMin": mu_s_min,
+        "texels": options.texels or "exact",
         "holds": roles,
         "tolerance": options.tolerance,
         "orders": options.orders or "all",

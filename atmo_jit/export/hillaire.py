@@ -45,7 +45,7 @@ ROLES = {
 
 def make(layout: str, air: Atmosphere, options: Options, clock: Clock, progress: Callable[[float], None]) -> Made:
     """Files of the layout."""
-    refuse(layout, options, ("mu_s_min", "size"))
+    refuse(layout, options, ("mu_s_min", "size", "texels"))
     precision = only(layout, "precision", options.precision, ("half", "float"), "of the EXR files")
     colours = channels(air, options.colour or "samples")
     altitude = 2.0 if options.altitude_m is None else options.altitude_m

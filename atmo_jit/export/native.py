@@ -28,7 +28,7 @@ FILE = "solution.npz"
 
 def make(layout: str, air: Atmosphere, options: Options, clock: Clock, progress: Callable[[float], None]) -> Made:
     """The files of a solved sky."""
-    refuse(layout, options, ("mu_s_min", "size", "precision", "colour", "altitude_m", "sun_zenith_deg"))
+    refuse(layout, options, ("mu_s_min", "size", "precision", "colour", "altitude_m", "sun_zenith_deg", "texels"))
     sky = Sky(air, options.orders, options.tolerance)
     clock.stage("solve")
     return files(sky)

@@ -41,7 +41,7 @@ HOLDS = (
 
 def make(layout: str, air: Atmosphere, options: Options, clock: Clock, progress: Callable[[float], None]) -> Made:
     """Files of the layout."""
-    refuse(layout, options, ("mu_s_min", "altitude_m", "sun_zenith_deg"))
+    refuse(layout, options, ("mu_s_min", "altitude_m", "sun_zenith_deg", "texels"))
     precision = only(layout, "precision", options.precision, ("half", "float"), "of the EXR files")
     size = options.size or SIZE
     if len(size) != 3 or min(size) < 2 or np.prod(size) > 16 << 20:
