@@ -35,10 +35,11 @@ class SunColumns:
     """Table of mean densities over altitude and mu in [0, 1] (logarithmic from the horizontal); bilinear.
 
     ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} -
-    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
+    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R). ``table``:
+    the numbers, where they are known already.
     """
 
-    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128)) -> None:
+    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128), table: Any = None) -> None:
         self.optics = optics
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
@@ -54,8 +55,8 @@ class SunColumns:
         self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
         self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
-        self._table = self._build() if self._count else None
-        dr.eval(self._table)
+        self.table = table if table is not None else self._build() if self._count else None
+        dr.eval(self.table)
 
     def _build(self) -> Any:
         t = types()
@@ -115,7 +116,7 @@ class SunColumns:
         fx = x - t.Float(column)
         corner = dr.fma(shell, self._rows + 1, row) * cosines + column
         n = self._count
-        a, b, c, d = (packet(self._table, corner + offset, n, active) for offset in (0, 1, cosines, cosines + 1))
+        a, b, c, d = (packet(self.table, corner + offset, n, active) for offset in (0, 1, cosines, cosines + 1))
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         result = []
         for k in range(n):
