@@ -54,9 +54,10 @@ class _Band:
         orders: int | None,
         tolerance: float,
         suns: tuple[float, float] | None,
+        layout: Atmosphere,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(atmosphere, resolution, suns)
+        grid = Grid.of(layout, resolution, suns)
         self.columns = sun_columns(self.optics, grid)
         self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
@@ -68,7 +69,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
+    used, so that atmospheres close to each other differ by nothing but their light. Raises AtmosphereError, LLVMError,
+    InputError.
     """
 
     def __init__(
@@ -78,8 +81,10 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        layout: Atmosphere | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
@@ -88,7 +93,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
+        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, layout) for band in bands]
 
     @property
     def bands(self) -> list[_Band]:

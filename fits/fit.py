@@ -1,0 +1,197 @@
+"""The fit: from observations and a configuration to values, errors, and what they are worth.
+
+>>> from atmo_jit.fits import FitConfig, fit, load_observations
+>>> result = fit(load_observations("scan.npz"), FitConfig.load("fit.toml"))  # doctest: +SKIP
+>>> result.parameters["mie.phase.g"]["value"]  # doctest: +SKIP
+
+In steps, each from where the one before ended: a part of the samples; with a robust loss, once more with the scale of
+the residuals that were left; all samples, on nodes placed for the atmosphere found. Where the end is poor, other
+starting values are tried.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from atmo_jit.errors import InputError
+
+from .config import FitConfig
+from .observations import Observations
+from .optimise import MAX_ITERATIONS, Residuals, Solution, minimise
+from .problem import HUBER, Evaluation, Problem, without_darkness
+from .uncertainty import Uncertainty, uncertainty
+from .wavelengths import at_wavelengths
+
+FEW = 300  # samples (directions) that the first steps look at
+UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
+POOR = 5.0  # residual over sigma, and
+POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
+RESTARTS = 3
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What :func:`fit` found: the ``problem`` and its ``u`` at the minimum, what was ``found`` there, ``errors``, and
+    how it went."""
+
+    problem: Problem
+    u: np.ndarray
+    found: Evaluation
+    errors: Uncertainty
+    solution: Solution
+    starts: int
+    seconds: float
+    dropped: int
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Value of every scalar by name."""
+        return dict(zip((s.name for s in self.problem.scalars), self.problem.values(self.u).tolist(), strict=True))
+
+
+def fit(data: Observations, config: FitConfig, progress: Progress | None = None) -> Fit:
+    """Fit the free values of ``config`` to ``data``. ``progress`` is called with an estimate of the fraction done.
+
+    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right.
+    """
+    started = time.perf_counter()
+    air = at_wavelengths(config.atmosphere, data.wavelengths_nm)
+    before = np.count_nonzero(data.used)
+    if config.residual == "log":
+        data = without_darkness(data)
+    data = data.part(np.flatnonzero(data.used.any(axis=1)))
+    samples = int(np.count_nonzero(data.used))
+    whole = Problem.of(replace(config, atmosphere=air), data)
+    _check_count(whole, samples)
+    whole.model.place(whole.atmosphere_values(whole.start))
+    rows = _some(data, FEW)
+    _check_units(whole.part(rows))
+    report = _Report(progress)
+    tries = []
+    for start in _starting_points(whole):
+        tries.append(_minimum(whole, rows, start, report))
+        problem, u, solution = tries[-1]
+        if solution.converged and not _poor(problem, u):
+            break
+        if len(tries) > RESTARTS:
+            break
+    # Poor ends are compared by their residuals, whose scale does not change with the loss.
+    problem, u, solution = min(tries, key=lambda end: _scale(end[0].evaluate(end[1])))
+    problem, u, solution = _polished(whole, u, solution, report)
+    found = problem.evaluate(u, jacobian=True)
+    errors = uncertainty(problem, u, found)
+    return Fit(problem, u, found, errors, solution, len(tries), time.perf_counter() - started, int(before - samples))
+
+
+class _Report:
+    """Progress over all minimisations: every iteration takes a share of what is left."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress, self._left, self.iterations = progress, 1.0, 0
+
+    def __call__(self, iteration: int, cost: float) -> None:
+        self.iterations += 1
+        self._left *= 0.9
+        if self._progress is not None:
+            self._progress(1.0 - self._left)
+
+
+def _minimum(whole: Problem, rows: np.ndarray, start: np.ndarray, report: _Report) -> tuple[Problem, np.ndarray, Solution]:
+    """The minimum for some of the samples from one start; with its problem."""
+    u = start
+    for _ in range(3):
+        if whole.model.strays(whole.atmosphere_values(u)) or u is start:
+            whole.model.place(whole.atmosphere_values(u))
+        problem = whole.part(rows)
+        problem = problem.with_loss(_loss(problem, u))
+        solution = _solve(problem, u, report)
+        u = solution.u
+        settled = not whole.config.robust or 0.7 < _loss(problem, u) / problem.huber < 1.4
+        if settled and not whole.model.strays(whole.atmosphere_values(u)):
+            break
+    return problem, u, solution
+
+
+def _polished(whole: Problem, u: np.ndarray, solution: Solution, report: _Report) -> tuple[Problem, np.ndarray, Solution]:
+    """The minimum for all samples, on nodes for the atmosphere at ``u``."""
+    whole.model.place(whole.atmosphere_values(u))
+    problem = whole.with_loss(_loss(whole, u))
+    last = _solve(problem, u, report)
+    return problem, last.u, replace(last, iterations=report.iterations)
+
+
+def _solve(problem: Problem, u: np.ndarray, report: _Report) -> Solution:
+    functions = Residuals(
+        lambda u: problem.evaluate(u).residual, lambda u: problem.evaluate(u, jacobian=True).jacobian
+    )
+    return minimise(functions, u, method=problem.config.optimiser, max_iterations=MAX_ITERATIONS, progress=report)
+
+
+def _scale(found: Evaluation) -> float:
+    """Robust standard deviation of the residuals over sigma."""
+    return 1.4826 * float(np.nanmedian(np.abs(found.raw)))
+
+
+def _loss(problem: Problem, u: np.ndarray) -> float:
+    return HUBER * max(1.0, _scale(problem.evaluate(u))) if problem.config.robust else np.inf
+
+
+def _poor(problem: Problem, u: np.ndarray) -> bool:
+    """Whether the model is far from the data, in sigma and in per cent."""
+    found = problem.evaluate(u)
+    with np.errstate(invalid="ignore"):
+        relative = float(np.nanmedian(np.abs(found.predicted / problem.data.radiance - 1.0)))
+    return _scale(found) > POOR and relative > POOR_LOG
+
+
+def _starting_points(whole: Problem) -> list[np.ndarray]:
+    """The start, then logarithmic scalars ten times larger and smaller and the others in the middle of their ranges."""
+    points = [whole.start]
+    for factor in (10.0, 0.1, 1.0):
+        middle = [
+            s.inner(s.start * factor) if s.logarithmic and not s.nuisance else 0.0 if s.bounded else s.inner(s.start)
+            for s in whole.scalars
+        ]
+        points.append(np.array(middle))
+    return points
+
+
+def _some(data: Observations, count: int) -> np.ndarray:
+    """At most ``count`` rows, spread evenly over the order of the data, as many of each scan as it has part."""
+    total = len(data.radiance)
+    if total <= 2 * count:
+        return np.arange(total)
+    rows = np.sort(np.random.default_rng(0).permutation(total)[:count])
+    missing = [int(np.flatnonzero(data.scan == s)[0]) for s in range(data.scans) if not np.any(data.scan[rows] == s)]
+    return np.union1d(rows, np.array(missing, int))
+
+
+def _check_count(problem: Problem, samples: int) -> None:
+    unknowns = sum(not np.isfinite(s.prior_sigma) for s in problem.scalars)
+    if samples < max(unknowns, 1):
+        raise InputError(
+            f"observations: {samples} samples for {unknowns} unknowns without a prior; needed are at least {unknowns}"
+        )
+
+
+def _check_units(problem: Problem) -> None:
+    """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
+    if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
+        return  # the calibration is free: any unit will do
+    ratios = []
+    for factor in (1.0, 0.1, 10.0):
+        u = [s.inner(s.start * factor) if s.logarithmic and not s.nuisance else s.inner(s.start) for s in problem.scalars]
+        predicted = problem.evaluate(np.array(u)).predicted
+        ratios.append(float(np.nanmedian(problem.data.radiance / np.maximum(predicted, 1e-30))))
+    ratio = min(ratios, key=lambda r: abs(np.log(max(r, 1e-30))))
+    if not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+        raise InputError(
+            f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
+            "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
+        )
