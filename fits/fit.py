@@ -21,7 +21,7 @@ from atmo_jit.errors import InputError
 
 from .config import FitConfig
 from .observations import Observations
-from .optimise import MAX_ITERATIONS, Residuals, Solution, minimise
+from .optimise import STEP_TOLERANCE, Residuals, Solution, minimise
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 from .wavelengths import at_wavelengths
@@ -31,6 +31,7 @@ UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 RESTARTS = 3
+FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
 
 Progress = Callable[[float], None]
 
@@ -110,7 +111,7 @@ def _minimum(whole: Problem, rows: np.ndarray, start: np.ndarray, report: _Repor
             whole.model.place(whole.atmosphere_values(u))
         problem = whole.part(rows)
         problem = problem.with_loss(_loss(problem, u))
-        solution = _solve(problem, u, report)
+        solution = _solve(problem, u, report, FIRST_TOLERANCE)
         u = solution.u
         settled = not whole.config.robust or 0.7 < _loss(problem, u) / problem.huber < 1.4
         if settled and not whole.model.strays(whole.atmosphere_values(u)):
@@ -122,15 +123,17 @@ def _polished(whole: Problem, u: np.ndarray, solution: Solution, report: _Report
     """The minimum for all samples, on nodes for the atmosphere at ``u``."""
     whole.model.place(whole.atmosphere_values(u))
     problem = whole.with_loss(_loss(whole, u))
-    last = _solve(problem, u, report)
+    last = _solve(problem, u, report, STEP_TOLERANCE)
     return problem, last.u, replace(last, iterations=report.iterations)
 
 
-def _solve(problem: Problem, u: np.ndarray, report: _Report) -> Solution:
+def _solve(problem: Problem, u: np.ndarray, report: _Report, step_tolerance: float) -> Solution:
     functions = Residuals(
         lambda u: problem.evaluate(u).residual, lambda u: problem.evaluate(u, jacobian=True).jacobian
     )
-    return minimise(functions, u, method=problem.config.optimiser, max_iterations=MAX_ITERATIONS, progress=report)
+    return minimise(
+        functions, u, method=problem.config.optimiser, step_tolerance=step_tolerance, progress=report
+    )
 
 
 def _scale(found: Evaluation) -> float:

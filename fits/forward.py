@@ -28,6 +28,7 @@ from atmo_jit.sky import Sky
 STEP = 0.005
 SMALLEST = {"ground_albedo": 0.5, "g": 0.5, "single_scattering_albedo": 0.5}  # values below are stepped as these
 SUNS_DEG = 5.0  # suns are solved from and to multiples of this, so that small turns keep the nodes
+KEPT = 4  # skies, and radiances of the samples
 FOREIGN = 2.0  # factor of optical depth from which on an atmosphere's nodes are placed anew
 
 Values = Mapping[str, Any]
@@ -55,6 +56,7 @@ class SkyModel:
         self._resolution: Resolution | None = None
         self._layout: Atmosphere | None = None
         self._solved: dict[Any, Sky] = {}
+        self._seen: dict[Any, np.ndarray] = {}
         self._views = (doubles(altitude_m), doubles(view_zenith))
 
     def samples(self, rows: np.ndarray) -> SkyModel:
@@ -80,7 +82,12 @@ class SkyModel:
 
     def radiance(self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         """Radiance [N, W] with the values under the dotted names of ``values`` replaced; angles in radians [N]."""
-        return self._evaluate([values], values, sun_zenith, azimuth)
+        key = (_key(values), sun_zenith.tobytes(), azimuth.tobytes(), id(self._layout))
+        if key not in self._seen:
+            while len(self._seen) >= KEPT:
+                self._seen.pop(next(iter(self._seen)))
+            self._seen[key] = self._evaluate([values], values, sun_zenith, azimuth)
+        return self._seen[key]
 
     def derivatives(
         self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, radiance: np.ndarray
@@ -159,13 +166,17 @@ class SkyModel:
         )
         key = (hash(air), suns)
         if key not in self._solved:
-            while len(self._solved) >= 4:
+            while len(self._solved) >= KEPT:
                 self._solved.pop(next(iter(self._solved)))
             layout = self._layout.replace({name: values[name] for name in self.others})
             self._solved[key] = Sky(
                 air, tolerance=self.tolerance, resolution=self._resolution, suns=suns, layout=layout
             )
         return self._solved[key]
+
+
+def _key(values: Values) -> Any:
+    return tuple((name, np.asarray(value).tobytes()) for name, value in sorted(values.items()))
 
 
 def _depths(air: Atmosphere) -> np.ndarray:

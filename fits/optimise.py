@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 MAX_ITERATIONS = 60
-# A step is done when it is shorter than this part of the standard errors.
+# Part of the standard errors below which a step changes nothing that matters.
 STEP_TOLERANCE = 0.02
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
@@ -78,17 +78,20 @@ def minimise(
     *,
     method: str = "levenberg_marquardt",
     max_iterations: int = MAX_ITERATIONS,
+    step_tolerance: float = STEP_TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise half the sum of squares from ``start``. ``progress`` is called with iteration and cost."""
+    """Minimise half the sum of squares from ``start``. ``step_tolerance``: a step shorter than this
+    part of the standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration
+    and cost."""
     run = {"levenberg_marquardt": _levenberg_marquardt, "lbfgsb": _lbfgsb}[method]
     jax, _ = _jaxopt()
     with jax.enable_x64(True):
-        return run(functions, np.asarray(start, float), max_iterations, progress or (lambda *_: None))
+        return run(functions, np.asarray(start, float), max_iterations, step_tolerance, progress or (lambda *_: None))
 
 
 def _levenberg_marquardt(
-    functions: Residuals, start: np.ndarray, max_iterations: int, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
 ) -> Solution:
     """Madsen & Nielsen, Introduction to Optimization and Data Fitting (2010), algorithm 6.18, as jaxopt has it."""
     jax, jaxopt = _jaxopt()
@@ -127,14 +130,14 @@ def _levenberg_marquardt(
         length = float(np.sqrt(max(step @ hessian @ step, 0.0) / len(step)))
         if now < before:
             best, u, failures = now, u_next, 0
-            if length < STEP_TOLERANCE:
+            if length < enough:
                 reason = f"the last step was {length:.1g} standard errors"
                 return Solution(np.asarray(u), best, iteration, True, reason)
             if before - now < COST_TOLERANCE * before:
                 return Solution(np.asarray(u), best, iteration, True, "the cost no longer changes")
         else:
             failures += 1
-            if length < STEP_TOLERANCE or failures > 6:
+            if length < enough or failures > 6:
                 small = length < 1.0
                 reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
                 return Solution(np.asarray(u), best, iteration, small, reason)
@@ -142,7 +145,7 @@ def _levenberg_marquardt(
 
 
 def _lbfgsb(
-    functions: Residuals, start: np.ndarray, max_iterations: int, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
 ) -> Solution:
     """L-BFGS-B (Byrd et al. 1995), as jaxopt has it, on half the sum of squares."""
     _, jaxopt = _jaxopt()
@@ -164,7 +167,7 @@ def _lbfgsb(
         length = float(np.linalg.norm(jacobian @ step) / np.sqrt(len(step)))
         before, cost, u = cost, functions.cost(u_next), u_next
         progress(iteration, cost)
-        if length < STEP_TOLERANCE:
+        if length < enough:
             return Solution(np.asarray(u), cost, iteration, True, f"the last step was {length:.1g} standard errors")
         if abs(before - cost) <= COST_TOLERANCE * before:
             return Solution(np.asarray(u), cost, iteration, True, "the cost no longer changes")
