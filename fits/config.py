@@ -77,13 +77,14 @@ class FitConfig:
             raise InputError(f"{where}: free is missing or empty; must name at least one value of the atmosphere")
         for name in free:
             if name.rpartition(".")[2] in ("wavelengths_nm", "bottom_radius_m", "top_radius_m"):
-                raise InputError(f"{where}: free.{name}: cannot be fitted; free values are coefficients, g, albedos, heights")
+                raise InputError(f"{where}: free.{name}: cannot be fitted; coefficients, g, albedos and heights can")
         nuisance = _table(document, "nuisance", where)
         _known(nuisance, NUISANCES, f"{where}: nuisance")
         nuisance = {name: _entry(spec, NUISANCE_KEYS, f"{where}: nuisance.{name}") for name, spec in nuisance.items()}
         for name, spec in nuisance.items():
             for key, value in spec.items():
-                if isinstance(value, bool) or not isinstance(value, (int, float)) or (key == "sigma" and not value > 0.0):
+                number = isinstance(value, (int, float)) and not isinstance(value, bool)
+                if not number or (key == "sigma" and not value > 0.0):
                     allowed = "a number > 0" if key == "sigma" else "a number"
                     raise InputError(f"{where}: nuisance.{name}: {key} is {shown(value)}; must be {allowed}")
         picture = document.get("picture")

@@ -31,6 +31,8 @@ UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 RESTARTS = 3
+MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
+LEAST_CLUSTERS = 6  # from which a scatter of means is known
 FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
 
 Progress = Callable[[float], None]
@@ -38,8 +40,8 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Fit:
-    """What :func:`fit` found: the ``problem`` and its ``u`` at the minimum, what was ``found`` there, ``errors``, and
-    how it went."""
+    """What :func:`fit` found: the ``problem`` and its ``u`` at the minimum, what was ``found`` there, ``errors``, how
+    it went, and ``unseen``: the samples of directions that are masked altogether, and what the fit predicts there."""
 
     problem: Problem
     u: np.ndarray
@@ -49,6 +51,7 @@ class Fit:
     starts: int
     seconds: float
     dropped: int
+    unseen: tuple[Observations, np.ndarray] | None
 
     @property
     def values(self) -> dict[str, float]:
@@ -66,7 +69,7 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     before = np.count_nonzero(data.used)
     if config.residual == "log":
         data = without_darkness(data)
-    data = data.part(np.flatnonzero(data.used.any(axis=1)))
+    everything, data = data, data.part(np.flatnonzero(data.used.any(axis=1)))
     samples = int(np.count_nonzero(data.used))
     whole = Problem.of(replace(config, atmosphere=air), data)
     _check_count(whole, samples)
@@ -84,10 +87,15 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
             break
     # Poor ends are compared by their residuals, whose scale does not change with the loss.
     problem, u, solution = min(tries, key=lambda end: _scale(end[0].evaluate(end[1])))
-    problem, u, solution = _polished(whole, u, solution, report)
+    problem, u, solution = _polished(whole, u, report)
     found = problem.evaluate(u, jacobian=True)
     errors = uncertainty(problem, u, found)
-    return Fit(problem, u, found, errors, solution, len(tries), time.perf_counter() - started, int(before - samples))
+    masked = everything.part(np.flatnonzero(~everything.used.any(axis=1)))
+    unseen = None
+    if len(masked.radiance):
+        unseen = masked, Problem(problem.config, masked, problem.model.at(masked), problem.leaves).evaluate(u).predicted
+    seconds = time.perf_counter() - started
+    return Fit(problem, u, found, errors, solution, len(tries), seconds, int(before - samples), unseen)
 
 
 class _Report:
@@ -103,26 +111,29 @@ class _Report:
             self._progress(1.0 - self._left)
 
 
-def _minimum(whole: Problem, rows: np.ndarray, start: np.ndarray, report: _Report) -> tuple[Problem, np.ndarray, Solution]:
+End = tuple[Problem, np.ndarray, Solution]
+
+
+def _minimum(whole: Problem, rows: np.ndarray, start: np.ndarray, report: _Report) -> End:
     """The minimum for some of the samples from one start; with its problem."""
     u = start
     for _ in range(3):
         if whole.model.strays(whole.atmosphere_values(u)) or u is start:
             whole.model.place(whole.atmosphere_values(u))
         problem = whole.part(rows)
-        problem = problem.with_loss(_loss(problem, u))
+        problem = problem.with_loss(*_loss(problem, u, first=u is start))
         solution = _solve(problem, u, report, FIRST_TOLERANCE)
         u = solution.u
-        settled = not whole.config.robust or 0.7 < _loss(problem, u) / problem.huber < 1.4
-        if settled and not whole.model.strays(whole.atmosphere_values(u)):
+        excess = _loss(problem, u)[1]
+        if 0.7 < excess / problem.excess < 1.4 and not whole.model.strays(whole.atmosphere_values(u)):
             break
     return problem, u, solution
 
 
-def _polished(whole: Problem, u: np.ndarray, solution: Solution, report: _Report) -> tuple[Problem, np.ndarray, Solution]:
+def _polished(whole: Problem, u: np.ndarray, report: _Report) -> End:
     """The minimum for all samples, on nodes for the atmosphere at ``u``."""
     whole.model.place(whole.atmosphere_values(u))
-    problem = whole.with_loss(_loss(whole, u))
+    problem = whole.with_loss(*_loss(whole, u))
     last = _solve(problem, u, report, STEP_TOLERANCE)
     return problem, last.u, replace(last, iterations=report.iterations)
 
@@ -141,8 +152,23 @@ def _scale(found: Evaluation) -> float:
     return 1.4826 * float(np.nanmedian(np.abs(found.raw)))
 
 
-def _loss(problem: Problem, u: np.ndarray) -> float:
-    return HUBER * max(1.0, _scale(problem.evaluate(u))) if problem.config.robust else np.inf
+def _loss(problem: Problem, u: np.ndarray, first: bool = False) -> tuple[float, float]:
+    """d of the loss and the excess of the residuals at ``u``; at a start, which may be anywhere, no excess."""
+    found = problem.evaluate(u)
+    scale = _scale(found)
+    huber = HUBER * max(1.0, scale) if problem.config.robust else np.inf
+    raw = found.raw[problem.data.used]
+    variance = scale**2 if problem.config.robust else float(raw @ raw) / len(raw)
+    if first or variance < MODEL_ERRS:
+        return huber, 1.0
+    bounded = np.clip(raw / np.sqrt(variance), -3.0, 3.0)
+    effects = [1.0]
+    for cluster in problem.clusters():
+        sizes = np.bincount(cluster)
+        sizes, sums = sizes[sizes > 0], np.bincount(cluster, bounded)[sizes > 0]
+        if len(sizes) >= LEAST_CLUSTERS:
+            effects.append(float(np.mean(sums**2 / sizes) / np.mean(bounded**2)))
+    return huber, variance * max(effects)
 
 
 def _poor(problem: Problem, u: np.ndarray) -> bool:
@@ -189,7 +215,7 @@ def _check_units(problem: Problem) -> None:
         return  # the calibration is free: any unit will do
     ratios = []
     for factor in (1.0, 0.1, 10.0):
-        u = [s.inner(s.start * factor) if s.logarithmic and not s.nuisance else s.inner(s.start) for s in problem.scalars]
+        u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
         predicted = problem.evaluate(np.array(u)).predicted
         ratios.append(float(np.nanmedian(problem.data.radiance / np.maximum(predicted, 1e-30))))
     ratio = min(ratios, key=lambda r: abs(np.log(max(r, 1e-30))))

@@ -23,6 +23,8 @@ from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.resolution import Resolution, column_of
 from atmo_jit.sky import Sky
 
+from .observations import Observations
+
 # Steps of differences, relative to the value: long enough for single precision, short enough for curvature (5e-3 of a
 # derivative at most, and a fit's minimum does not depend on it).
 STEP = 0.005
@@ -59,10 +61,10 @@ class SkyModel:
         self._seen: dict[Any, np.ndarray] = {}
         self._views = (doubles(altitude_m), doubles(view_zenith))
 
-    def samples(self, rows: np.ndarray) -> SkyModel:
-        """The model for some of the samples, with the same nodes."""
+    def at(self, data: Observations) -> SkyModel:
+        """The model for other samples, with the same nodes."""
         other = SkyModel(
-            self.atmosphere, self.altitude_m[rows], self.view_zenith[rows], self.tolerance, self.spectral, self.others
+            self.atmosphere, data.altitude_m, data.view_zenith, self.tolerance, self.spectral, self.others
         )
         other._resolution, other._layout = self._resolution, self._layout
         return other
@@ -131,7 +133,8 @@ class SkyModel:
         document = airs[0].to_dict()
 
         def gathered(read: Any) -> list[float]:
-            return np.concatenate([np.broadcast_to(read(air), base.wavelengths_nm.shape) for air in airs])[index].tolist()
+            columns = [np.broadcast_to(read(air), base.wavelengths_nm.shape) for air in airs]
+            return np.concatenate(columns)[index].tolist()
 
         for name in ("wavelengths_nm", "solar_irradiance", "ground_albedo"):
             document[name] = gathered(lambda air, name=name: getattr(air, name))

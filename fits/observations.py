@@ -45,9 +45,9 @@ CSV_LIMIT = 2**28
 
 @dataclass(frozen=True)
 class Observations:
-    """Checked observations: ``radiance``, ``sigma`` [N, C], float64, NaN where there is no sample or it is masked;
-    ``sun_zenith``, ``view_zenith``, ``azimuth`` (of the view minus that of the sun), radians [N]; ``altitude_m`` [N];
-    ``scan`` [N], 0 to scans - 1; ``wavelengths_nm`` [W].
+    """Checked observations: ``radiance``, ``sigma`` [N, C], float64, NaN where there is no sample; ``mask`` [N, C],
+    true where it is to be used; ``sun_zenith``, ``view_zenith``, ``azimuth`` (of the view minus that of the sun),
+    radians [N]; ``altitude_m`` [N]; ``scan`` [N], 0 to scans - 1; ``wavelengths_nm`` [W].
 
     ``mixing`` [C, W]: channels of a picture as sums over wavelengths; None: channels are wavelengths. ``sun_azimuth``
     [N]: radians clockwise from north where it is known, else None. ``rows`` [N]: which of the samples given they are.
@@ -61,6 +61,7 @@ class Observations:
     view_zenith: np.ndarray
     azimuth: np.ndarray
     scan: np.ndarray
+    mask: np.ndarray
     mixing: np.ndarray | None = None
     sun_azimuth: np.ndarray | None = None
     rows: np.ndarray | None = None
@@ -69,7 +70,7 @@ class Observations:
     @property
     def used(self) -> np.ndarray:
         """Which samples take part: bool [N, C]."""
-        return np.isfinite(self.radiance)
+        return self.mask & np.isfinite(self.radiance)
 
     @property
     def scans(self) -> int:
@@ -78,7 +79,7 @@ class Observations:
 
     def part(self, rows: np.ndarray) -> Observations:
         """Some of the samples; all scans are kept."""
-        arrays = ("radiance", "sigma", "altitude_m", "sun_zenith", "view_zenith", "azimuth", "scan")
+        arrays = ("radiance", "sigma", "altitude_m", "sun_zenith", "view_zenith", "azimuth", "scan", "mask")
         changed = {name: getattr(self, name)[rows] for name in arrays}
         changed["rows"] = self.rows[rows]
         changed["sun_azimuth"] = None if self.sun_azimuth is None else self.sun_azimuth[rows]
@@ -108,14 +109,14 @@ def observations(arrays: Mapping[str, Any], where: str = "observations", *, mixi
             + ("wavelengths" if mixing is None else "channels")
         )
     count = len(radiance)
-    radiance = np.where(_mask(arrays.get("mask"), radiance.shape, where), radiance, np.nan)
-    if not np.isfinite(radiance).any():
+    mask = _mask(arrays.get("mask"), radiance.shape, where)
+    if not np.isfinite(radiance[mask]).any():
         raise InputError(f"{where}: radiance holds no number that is not masked; at least one sample is needed")
     if np.isinf(radiance).any():
         raise InputError(f"{where}: radiance is infinite at {shown(_first(np.isinf(radiance)))}; NaN means no sample")
     if not np.any(radiance > 0.0):
         raise InputError(f"{where}: radiance is nowhere > 0; must be in W m^-2 sr^-1 nm^-1")
-    sigma = _sigma(arrays, radiance, where)
+    sigma = _sigma(arrays, radiance, mask, where)
     places = {name: _column(arrays[name], name, count, where) for name in PLACES}
     sun_azimuth = None
     if "azimuth_deg" in arrays:
@@ -126,9 +127,7 @@ def observations(arrays: Mapping[str, Any], where: str = "observations", *, mixi
     else:
         raise InputError(f"{where}: azimuth_deg is missing; needed is it, or sun_azimuth_deg with view_azimuth_deg")
     keep = np.isfinite(radiance).any(axis=1)
-    views = check_views(
-        {name: v[keep] for name, v in places.items()} | {"azimuth_deg": azimuth[keep]}, where=where
-    )
+    views = check_views({name: v[keep] for name, v in places.items()} | {"azimuth_deg": azimuth[keep]}, where=where)
     return Observations(
         radiance[keep],
         sigma[keep],
@@ -136,6 +135,7 @@ def observations(arrays: Mapping[str, Any], where: str = "observations", *, mixi
         views["altitude_m"],
         *(np.radians(views[name]) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")),
         _scan(arrays.get("scan"), count, where)[keep],
+        mask[keep],
         None if mixing is None else np.asarray(mixing, float),
         None if sun_azimuth is None else np.radians(sun_azimuth[keep]),
         np.flatnonzero(keep),
@@ -154,7 +154,7 @@ def load_observations(path: str | Path) -> Observations:
     raise InputError(f"observations {shown(str(path), 200)}: the name must end in .npz, .csv or .exr")
 
 
-def _sigma(arrays: Mapping[str, Any], radiance: np.ndarray, where: str) -> np.ndarray:
+def _sigma(arrays: Mapping[str, Any], radiance: np.ndarray, mask: np.ndarray, where: str) -> np.ndarray:
     if "sigma" in arrays and "relative_sigma" in arrays:
         raise InputError(f"{where}: sigma and relative_sigma are both there; must be one of them")
     name = "sigma" if "sigma" in arrays else "relative_sigma"
@@ -164,9 +164,9 @@ def _sigma(arrays: Mapping[str, Any], radiance: np.ndarray, where: str) -> np.nd
     try:
         given = np.broadcast_to(given, radiance.shape)
     except ValueError:
-        raise InputError(f"{where}: {name} has shape {given.shape}; must be {list(radiance.shape)} or a number") from None
-    used = np.isfinite(radiance)
-    bad = used & ~((given > 0.0) & np.isfinite(given))
+        allowed = f"{list(radiance.shape)} or a number"
+        raise InputError(f"{where}: {name} has shape {given.shape}; must be {allowed}") from None
+    bad = mask & np.isfinite(radiance) & ~((given > 0.0) & np.isfinite(given))
     if bad.any():
         raise InputError(f"{where}: {name}{list(_first(bad))} is {given[bad][0]:g}; must be a finite number > 0")
     if name == "sigma":
@@ -237,12 +237,14 @@ def _read_csv(path: Path) -> dict[str, Any]:
     if repeated is not None:
         raise InputError(f"{name}: column {shown(repeated)} is there twice")
     table = {}
-    for number, row in zip((i for i, _ in lines[1:]), rows[1:], strict=True):
+    for (number, _), row in zip(lines[1:], rows[1:], strict=True):
         if len(row) != len(header):
             raise InputError(f"{name}: line {number} has {len(row)} values but there are {len(header)} columns")
+    numbers = [number for number, _ in lines[1:]]
     for j, column in enumerate(header):
         if column in NAMES:
-            table[column] = np.array([_cell(row[j], column, i, name) for (i, _), row in zip(lines[1:], rows[1:], strict=True)])
+            cells = [_cell(row[j], column, number, name) for number, row in zip(numbers, rows[1:], strict=True)]
+            table[column] = np.array(cells)
     return _wide(table, name) | {column: 0 for column in header if column not in NAMES}
 
 

@@ -16,6 +16,8 @@ import numpy as np
 MAX_ITERATIONS = 60
 # Part of the standard errors below which a step changes nothing that matters.
 STEP_TOLERANCE = 0.02
+FAR = 1e6
+FORESEEN = 0.3  # part of a step's change that the Jacobian may have missed to be corrected and not computed
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
 
@@ -32,30 +34,52 @@ class Solution:
 
 
 class Residuals:
-    """Residuals [M] and their Jacobian [M, P] as functions on the host; both are kept for the last points."""
+    """Residuals [M] and their Jacobian [M, P] as functions on the host.
+
+    A Jacobian costs many times what residuals cost, so along a path of small steps it is not computed again but
+    corrected by what the step has shown (Broyden 1965), as long as it had foreseen most of that.
+    """
 
     def __init__(
         self, residual: Callable[[np.ndarray], np.ndarray], jacobian: Callable[[np.ndarray], np.ndarray]
     ) -> None:
-        self._functions = {"residual": residual, "jacobian": jacobian}
-        self._kept: dict[tuple[str, bytes], np.ndarray] = {}
-
-    def _get(self, name: str, u: Any) -> np.ndarray:
-        u = np.asarray(u, dtype=float)
-        key = name, u.tobytes()
-        if key not in self._kept:
-            while len(self._kept) >= 8:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._functions[name](u)
-        return self._kept[key]
+        self._residual, self._jacobian = residual, jacobian
+        self._kept: dict[bytes, np.ndarray] = {}
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self.exact = False
 
     def residual(self, u: Any) -> np.ndarray:
-        """[M] at u."""
-        return self._get("residual", u)
+        """[M] at u; kept for the last points."""
+        u = np.array(u, dtype=float)
+        key = u.tobytes()
+        if key not in self._kept:
+            while len(self._kept) >= 4:
+                self._kept.pop(next(iter(self._kept)))
+            # A step too far may end where nothing is finite: bad, but a number.
+            self._kept[key] = np.nan_to_num(self._residual(u), nan=FAR, posinf=FAR, neginf=-FAR)
+        return self._kept[key]
 
     def jacobian(self, u: Any) -> np.ndarray:
-        """[M, P] at u."""
-        return self._get("jacobian", u)
+        """[M, P] at u: corrected from the last point's, or ``exact``."""
+        u = np.array(u, dtype=float)
+        if self._last is not None:
+            before, jacobian = self._last
+            step = u - before
+            if not step.any():
+                return jacobian
+            foreseen = jacobian @ step
+            missed = self.residual(u) - self.residual(before) - foreseen
+            if np.linalg.norm(missed) < FORESEEN * np.linalg.norm(foreseen):
+                self._last = u, jacobian + np.outer(missed, step / (step @ step))
+                self.exact = False
+                return self._last[1]
+        return self.renewed(u)
+
+    def renewed(self, u: Any) -> np.ndarray:
+        """The exact Jacobian at u."""
+        u = np.array(u, dtype=float)
+        self._last, self.exact = (u, np.nan_to_num(self._jacobian(u))), True
+        return self._last[1]
 
     def cost(self, u: Any) -> float:
         """Half the sum of squares at u."""
@@ -107,7 +131,7 @@ def _levenberg_marquardt(
     def along(primals: Any, tangents: Any) -> Any:
         (u,), (tangent,) = primals, tangents
         # jaxopt asks for the Jacobian of steps that it then rejects, and multiplies it by zero.
-        rejected = functions.cost(u) > best
+        rejected = functions.cost(u) > best * (1.0 + 1e-9)
         jacobian = np.zeros((len(functions.residual(u)), len(start))) if rejected else functions.jacobian(u)
         return residual(u), jnp.asarray(jacobian) @ tangent
 
@@ -115,32 +139,37 @@ def _levenberg_marquardt(
         residual, materialize_jac=True, solver="cholesky", jit=False, implicit_diff=False, damping_parameter=1e-4
     )
     u = jnp.asarray(start)
+    functions.renewed(start)
     state = solver.init_state(u)
     failures = 0
     for iteration in range(1, max_iterations + 1):
-        before = best
         hessian = np.asarray(state.jtj)
         u_next, state = solver.update(u, state)
-        if not np.all(np.isfinite(np.asarray(state.delta))):
-            return Solution(np.asarray(u), best, iteration, False, "the data do not depend on a parameter: no step exists")
-        step = np.asarray(state.delta)
-        now = float(state.value)
-        progress(iteration, min(now, before))
+        step, now = np.asarray(state.delta), float(state.value)
+        if not np.all(np.isfinite(step)):
+            reason = "the data do not depend on a parameter: no step exists"
+            return Solution(np.asarray(u), best, iteration, False, reason)
+        progress(iteration, min(now, best))
         # The step in standard errors, root mean square: what another iteration would change.
         length = float(np.sqrt(max(step @ hessian @ step, 0.0) / len(step)))
-        if now < before:
+        gain = best - now
+        if gain > 0.0:
             best, u, failures = now, u_next, 0
             if length < enough:
                 reason = f"the last step was {length:.1g} standard errors"
                 return Solution(np.asarray(u), best, iteration, True, reason)
-            if before - now < COST_TOLERANCE * before:
+            if gain < COST_TOLERANCE * best and functions.exact:
                 return Solution(np.asarray(u), best, iteration, True, "the cost no longer changes")
-        else:
-            failures += 1
-            if length < enough or failures > 6:
-                small = length < 1.0
-                reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
-                return Solution(np.asarray(u), best, iteration, small, reason)
+            continue
+        failures += 1
+        if not functions.exact and length >= enough:
+            functions.renewed(u)
+            state = solver.init_state(u)
+        elif length < enough or failures > 6:
+            if length < 1.0:
+                return Solution(np.asarray(u), best, iteration, True, "no step lowers the cost")
+            reason = "no step lowers the cost although the gradient is not zero"
+            return Solution(np.asarray(u), best, iteration, False, reason)
     return Solution(np.asarray(u), best, max_iterations, False, f"{max_iterations} iterations were not enough")
 
 

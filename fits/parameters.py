@@ -32,6 +32,7 @@ from atmo_jit.errors import InputError
 MODES = ("scale", "per_wavelength", "angstrom")
 REFERENCE_NM = 550.0
 FAR_APART = 50.0  # ratio of bounds from which on a scalar is fitted on a logarithmic scale
+FARTHEST = 200.0  # of z without bounds
 EDGE = 1e-3  # part of the range that starts keep from the bounds, and within which a result is at a bound
 # Bounds where none are given, by the last part of the dotted name; None: a hundredth and a hundred times the start.
 BOUNDS: dict[str, tuple[float, float] | None] = {
@@ -88,7 +89,7 @@ class Scalar:
             low, high = self._z(self.low), self._z(self.high)
             z = low + (high - low) / (1.0 + np.exp(-np.clip(u, -40.0, 40.0)))
         else:
-            z = u * self.scale
+            z = float(np.clip(u * self.scale, -FARTHEST, FARTHEST))
         return float(np.exp(z)) if self.logarithmic else float(z)
 
     def slopes(self, u: float) -> tuple[float, float]:
@@ -168,7 +169,7 @@ def leaf_of(atmosphere: Atmosphere, name: str, spec: dict[str, Any]) -> Leaf:
     last = name.rpartition(".")[2]
     spectral = isinstance(current, np.ndarray) and current.shape == (count,)
     if not spectral and np.ndim(current):
-        raise InputError(f"free.{name}: is a list of {len(current)} values; numbers and values per wavelength can be free")
+        raise InputError(f"free.{name}: is a list of {len(current)} values; numbers and spectra can be free")
     # A number that may be one per wavelength (phase.g) stays a number unless a spectrum is asked for.
     mode = spec.get("mode", "scale")
     if mode not in MODES:

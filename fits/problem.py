@@ -5,6 +5,11 @@
 
 With a robust loss a residual r becomes f(r), f^2 / 2 = d^2 (sqrt(1 + (r / d)^2) - 1) (pseudo-Huber): quadratic up to
 about d, then linear, so that clouds, masts and what the model cannot follow do not decide. Priors stay quadratic.
+
+Where residuals are larger than sigma it is the model that errs, and its errors are alike at neighbouring directions and
+wavelengths: hundreds of samples then count as few. ``excess`` says by how much their weight is lowered against that of
+the priors; it is the variance of the residuals over sigma, times the design effect of Kish 1965, Survey Sampling,
+section 5.4: how much more the means of parts of the sky, or of wavelengths, scatter than means of independent samples.
 """
 
 from __future__ import annotations
@@ -21,12 +26,13 @@ from .parameters import Leaf, Scalar, leaf_of
 
 TURN = np.radians(0.02)  # step of differences by the sun's angles
 HUBER = 1.345  # robust scale at which a Gaussian sample loses 5 % of its worth (Huber 1964)
+SKY_PARTS = (3, 6)  # in zenith angle and azimuth: directions at which the model's errors are taken to be alike
 LEAST = 1e-30  # of a predicted radiance whose logarithm is taken
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """At one point: ``predicted`` [N, C]; ``raw`` residuals [N, C] over sigma, NaN where there is no sample;
+    """At one point: ``predicted`` [N, C]; ``raw`` residuals [N, C] over sigma, NaN where no sample is in use;
     ``residual`` [M], those of samples with the loss in them, then those of the priors; ``jacobian`` [M, P] of it by
     u, None if it was not asked for."""
 
@@ -39,36 +45,44 @@ class Evaluation:
 class Problem:
     """Unknowns ``scalars``: those of the atmosphere's leaves, then the nuisances of every scan.
 
-    ``huber``: d of the loss, infinite for plain least squares.
+    ``huber``: d of the loss, infinite for plain least squares. ``excess``: variance of a sample in units of sigma^2.
     """
 
     def __init__(
-        self, config: FitConfig, data: Observations, model: SkyModel, leaves: tuple[Leaf, ...], huber: float = np.inf
+        self,
+        config: FitConfig,
+        data: Observations,
+        model: SkyModel,
+        leaves: tuple[Leaf, ...],
+        huber: float = np.inf,
+        excess: float = 1.0,
     ) -> None:
-        self.config, self.data, self.model, self.leaves, self.huber = config, data, model, leaves, huber
+        self.config, self.data, self.model, self.leaves = config, data, model, leaves
+        self.huber, self.excess = huber, excess
         self._nuisances = _nuisances(config, data)
         self.scalars = (*(s for leaf in leaves for s in leaf.scalars), *(n.scalar for n in self._nuisances))
         self.logarithmic = config.residual == "log"
         self._used = data.used
         self._measured = np.log(np.maximum(data.radiance, LEAST)) if self.logarithmic else data.radiance
-        self._sigma = data.sigma / data.radiance if self.logarithmic else data.sigma
+        self._sigma = np.where(self._used, data.sigma / data.radiance if self.logarithmic else data.sigma, np.nan)
 
     @classmethod
     def of(cls, config: FitConfig, data: Observations) -> Problem:
         """The problem of a configuration whose atmosphere is at the observations' wavelengths."""
         leaves = tuple(leaf_of(config.atmosphere, name, spec) for name, spec in config.free.items())
-        spectral = tuple(leaf.name for leaf in leaves if np.ndim(leaf.values(_starts(leaf))) or leaf.name.endswith(".g"))
+        spectral = tuple(x.name for x in leaves if np.ndim(x.values(_starts(x))) or x.name.endswith(".g"))
         others = tuple(leaf.name for leaf in leaves if leaf.name not in spectral)
         model = SkyModel(config.atmosphere, data.altitude_m, data.view_zenith, config.tolerance, spectral, others)
         return cls(config, data, model, leaves)
 
-    def with_loss(self, huber: float) -> Problem:
-        """The same with another loss."""
-        return Problem(self.config, self.data, self.model, self.leaves, huber)
+    def with_loss(self, huber: float, excess: float) -> Problem:
+        """The same with another loss and weight of the samples."""
+        return Problem(self.config, self.data, self.model, self.leaves, huber, excess)
 
     def part(self, rows: np.ndarray) -> Problem:
         """The same for some of the samples."""
-        return Problem(self.config, self.data.part(rows), self.model.samples(rows), self.leaves, self.huber)
+        data = self.data.part(rows)
+        return Problem(self.config, data, self.model.at(data), self.leaves, self.huber, self.excess)
 
     @property
     def start(self) -> np.ndarray:
@@ -89,12 +103,12 @@ class Problem:
 
     def evaluate(self, u: np.ndarray, jacobian: bool = False) -> Evaluation:
         """Residuals at u, and their derivatives by u."""
-        v, values, data = self.values(u), self.atmosphere_values(u), self.data
+        v, values = self.values(u), self.atmosphere_values(u)
         factor, sun_zenith, azimuth = self._geometry_of(v)
         light = self.model.radiance(values, sun_zenith, azimuth)
         predicted = factor * self._mixed(light)
         raw = (self._compared(predicted) - self._measured) / self._sigma
-        loss, slope = _pseudo_huber(raw[self._used], self.huber)
+        loss, slope = (v / np.sqrt(self.excess) for v in _pseudo_huber(raw[self._used], self.huber))
         priors = [s.prior_residual(x) for s, x in zip(self.scalars, u, strict=True)]
         with_prior = [i for i, s in enumerate(self.scalars) if np.isfinite(s.prior_sigma)]
         residual = np.concatenate([loss, [priors[i][0] for i in with_prior]])
@@ -123,6 +137,16 @@ class Problem:
         below = np.zeros((len(with_prior), len(self.scalars)))
         below[np.arange(len(with_prior)), with_prior] = [priors[i][1] for i in with_prior]
         return Evaluation(predicted, raw, residual, np.concatenate([columns, below]))
+
+    def clusters(self) -> list[np.ndarray]:
+        """For every sample in use, numbers of its part of the sky (SKY_PARTS) and scan, and of its channel and scan."""
+        data = self.data
+        row, channel = np.nonzero(self._used)
+        zeniths, azimuths = SKY_PARTS
+        up = np.clip((1.0 - np.cos(data.view_zenith)) * zeniths, 0, zeniths - 1).astype(int)
+        around = ((data.azimuth % (2.0 * np.pi)) / (2.0 * np.pi) * azimuths).astype(int) % azimuths
+        part = (data.scan * zeniths + up) * azimuths + around
+        return [part[row], data.scan[row] * data.radiance.shape[1] + channel]
 
     def geometry(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Calibration [N, C], zenith angle of the sun and azimuth from it [N] (radians) at u."""
@@ -214,4 +238,5 @@ def _pseudo_huber(r: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
 
 def without_darkness(data: Observations) -> Observations:
     """The samples whose logarithm can be taken."""
-    return replace(data, radiance=np.where(data.radiance > 0.0, data.radiance, np.nan))
+    with np.errstate(invalid="ignore"):
+        return replace(data, radiance=np.where(data.radiance > 0.0, data.radiance, np.nan))

@@ -50,6 +50,7 @@ def result(fit: Fit) -> dict[str, Any]:
         "residual_robust": 1.4826 * float(np.median(np.abs(apart))),
         "rmse": _rms(predicted - measured),
         "relative_rms": _rms(relative[np.isfinite(relative)]),
+        **_with_masked(fit),
         "reduced_chi_square": reduced_chi_square(problem, found),
         "degrees_of_freedom": samples - len(problem.scalars),
         "degrees_of_freedom_for_signal": float(np.sum(errors.averaging_kernel)),
@@ -80,14 +81,14 @@ def _entry(scalar: Scalar, value: float, error: float, model_error: float, kerne
 
 
 def derived(air: Atmosphere, altitude_m: np.ndarray) -> dict[str, Any]:
-    """Vertical optical depths above the (mean) observer and the aerosol's asymmetry and single-scattering albedo, at the
-    atmosphere's wavelengths and at 440 and 550 nm."""
-    h = np.linspace(float(np.mean(altitude_m)), air.thickness_m, 4097) if np.mean(altitude_m) < air.thickness_m else None
+    """Vertical optical depths above the (mean) observer and the aerosol's asymmetry and single-scattering albedo, at
+    the atmosphere's wavelengths and at 440 and 550 nm."""
+    h = np.linspace(min(float(np.mean(altitude_m)), air.thickness_m), air.thickness_m, 4097)
     nm = air.wavelengths_nm
     count = len(nm)
 
     def depth(constituent: Any, coefficient: np.ndarray) -> np.ndarray:
-        return coefficient * (float(np.trapezoid(constituent.profile.density(h), h)) if h is not None else 0.0)
+        return coefficient * float(np.trapezoid(constituent.profile.density(h), h))
 
     depths = {c.name: depth(c, c.extinction_per_m) for c in air.constituents}
     aerosol = sum((depths[c.name] for c in air.mie), start=np.zeros(count))
@@ -121,6 +122,15 @@ def derived(air: Atmosphere, altitude_m: np.ndarray) -> dict[str, Any]:
         found[f"tau_{wavelength:.0f}"] = at(aerosol, wavelength)
         found[f"asymmetry_{wavelength:.0f}"] = at(mean_cosine, wavelength)
     return found
+
+
+def _with_masked(fit: Fit) -> dict[str, float]:
+    """Errors over all samples that there are, the masked ones too."""
+    parts = [(fit.problem.data, fit.found.predicted), *([fit.unseen] if fit.unseen else [])]
+    measured, predicted = (np.concatenate(v) for v in zip(*((d.radiance, p) for d, p in parts), strict=True))
+    there = np.isfinite(measured)
+    row = _row(predicted[there], measured[there])
+    return {"rmse_with_masked": row["rmse"], "relative_rms_with_masked": row["relative_rms"]}
 
 
 def _rms(values: np.ndarray) -> float:

@@ -1,17 +1,14 @@
 """How well a fit knows what it found: from the derivatives of the residuals at the minimum.
 
-All of it in the scalars' z (value or its logarithm; see :mod:`atmo_jit.fits.parameters`), J by z, rows of samples and
-of priors apart:
+All of it in the scalars' z (value or its logarithm; see :mod:`atmo_jit.fits.parameters`), J by z, rows of samples (over
+sigma) and of priors apart; kappa is the excess of :mod:`atmo_jit.fits.problem`, 1 where the model follows the data:
 
-    covariance          S = (J_d' J_d + J_p' J_p)^-1             Gauss-Newton; Rodgers 2000, eq. 5.8
-    averaging kernel    A = (J_d' J_d + B)^-1 J_d' J_d           Rodgers 2000, eq. 2.78; B: priors, and for scalars
-                                                                 without one their bounds, half their range one sigma
-    model error         S_m = S (sum_c g_c g_c' + J_p' J_p) S,   g_c = sum of J' r over a cluster of samples
+    covariance          S   = (J_d' J_d + J_p' J_p)^-1            Gauss-Newton; Rodgers 2000, eq. 5.8
+    with model error    S_m = (J_d' J_d / kappa + J_p' J_p)^-1
+    averaging kernel    A   = (J_d' J_d / kappa + B)^-1 J_d' J_d / kappa     Rodgers 2000, eq. 2.78; B: the priors,
+                                                                  and for scalars without one half their range as sigma
 
-S holds if nothing but the stated noise keeps model and data apart. Where the model errs its errors are alike at
-neighbouring directions and wavelengths, so that many samples count as few: S_m (Liang & Zeger 1986, eq. 11) sums the
-residuals over parts of the sky, or over wavelengths, before it squares them. The interval takes the widest of S, S
-times the reduced chi-square, and both S_m.
+S holds if nothing but the stated noise keeps model and data apart, which measured skies never grant.
 """
 
 from __future__ import annotations
@@ -23,10 +20,8 @@ import numpy as np
 from .parameters import Scalar
 from .problem import Evaluation, Problem
 
-LEAST_CLUSTERS = 6
 NARROWED = 0.5  # averaging kernel below which the prior knows more than the data
 ALIKE = 0.9  # correlation, by the data alone, from which on two parameters cannot be told apart
-SKY_PARTS = (3, 6)  # parts of the sky, in zenith angle and azimuth, in which the model's errors are taken to be alike
 
 
 @dataclass(frozen=True)
@@ -51,25 +46,15 @@ def uncertainty(problem: Problem, u: np.ndarray, found: Evaluation) -> Uncertain
     jacobian = found.jacobian / dz
     samples = int(np.count_nonzero(problem.data.used))
     data, priors = jacobian[:samples], jacobian[samples:]
-    known, told = data.T @ data, priors.T @ priors
-    inverse = _inverse(known + told)
-    errors = np.sqrt(np.diag(inverse))
+    weighed, told = data.T @ data, priors.T @ priors
+    inverse = _inverse(problem.excess * weighed + told)
+    with_model_error = _inverse(weighed + told)
     wide = np.array([_range(s) for s in scalars])
     bounds = np.diag(np.where(np.isfinite([s.prior_sigma for s in scalars]), 0.0, wide**-2.0))
-    kernel = np.diag(_inverse(known + told + bounds) @ known).clip(0.0, 1.0)
-    excess = max(1.0, reduced_chi_square(problem, found))
-    variances = [np.diag(inverse), np.diag(_inverse(known / excess + told))]
-    weighted = data * found.residual[:samples, None]
-    for cluster in _clusters(problem):
-        sums = np.zeros((cluster.max() + 1, len(scalars)))
-        np.add.at(sums, cluster, weighted)
-        count = len(np.unique(cluster))
-        if count >= LEAST_CLUSTERS:
-            middle = sums.T @ sums * (count / (count - 1.0)) + told
-            variances.append(np.diag(inverse @ middle @ inverse))
-    model_error = np.sqrt(np.max(variances, axis=0))
+    kernel = np.diag(_inverse(weighed + told + bounds) @ weighed).clip(0.0, 1.0)
+    errors, model_error = (np.sqrt(np.diag(m)) for m in (inverse, with_model_error))
     values = problem.values(u)
-    alone = _correlation(_inverse(known + 1e-12 * np.diag(np.diag(known))))
+    alone = _correlation(_inverse(weighed + 1e-12 * np.diag(np.diag(weighed))))
     sentences = _sentences(scalars, values, kernel, alone, model_error * np.abs(by_z))
     return Uncertainty(
         inverse * by_z * by_z[:, None],
@@ -107,17 +92,6 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
     return np.clip(covariance / size / size[:, None], -1.0, 1.0)
 
 
-def _clusters(problem: Problem) -> list[np.ndarray]:
-    """For every sample in use the number of its part of the sky and scan, and that of its channel."""
-    data = problem.data
-    row, channel = np.nonzero(data.used)
-    zeniths, azimuths = SKY_PARTS
-    up = np.minimum((1.0 - np.cos(data.view_zenith)) * zeniths, zeniths - 1).astype(int).clip(0)
-    around = ((data.azimuth % (2.0 * np.pi)) / (2.0 * np.pi) * azimuths).astype(int) % azimuths
-    part = (data.scan * zeniths + up) * azimuths + around
-    return [part[row], data.scan[row] * data.radiance.shape[1] + channel]
-
-
 def _sentences(
     scalars: tuple[Scalar, ...], values: np.ndarray, kernel: np.ndarray, alone: np.ndarray, model_error: np.ndarray
 ) -> tuple[str, ...]:
@@ -128,9 +102,8 @@ def _sentences(
             continue
         if kernel[i] < NARROWED:
             by = "its prior" if np.isfinite(scalar.prior_sigma) else "its bounds"
-            found.append(
-                f"{scalar.name} is not identifiable: the data narrow {by} down by {100.0 * (1 - np.sqrt(1 - kernel[i])):.0f} % only."
-            )
+            part = 100.0 * (1.0 - np.sqrt(1.0 - kernel[i]))
+            found.append(f"{scalar.name} is not identifiable: the data narrow {by} down by {part:.0f} % only.")
             continue
         low, high = scalar.interval(values[i], model_error[i])
         ends = [np.log(v) if scalar.logarithmic else v for v in (low, high, scalar.low, scalar.high)]

@@ -2,8 +2,9 @@
 
 Values are interpolated as ratios to spectra of known shape, so that three wavelengths are enough to know the rest:
 Rayleigh scattering as a ratio to Bodhaine et al. 1999, eq. 29; ozone to its absorption cross section at 233 K
-(Serdyuchenko et al. 2014); sunlight to ASTM G173-03. Everything else is linear in the wavelength, aerosol coefficients
-in the logarithm of both. Beyond the given wavelengths the ratios are held.
+(Serdyuchenko et al. 2014). Sunlight is ASTM G173-03 times the mean ratio of the given values to it, since values that
+stand for broad bands are off it by some per cent each. Everything else is linear in the wavelength, aerosol
+coefficients in the logarithm of both. Beyond the given wavelengths the ratios are held.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
-from atmo_jit.spectrum import SpectralBasis
+from atmo_jit.spectrum import solar_irradiance
 
 # Mean over 10 nm from each of 360, 370, ... 830 nm, 1e-27 m^2: Serdyuchenko et al. 2014, as in Bruneton's
 # precomputed_atmospheric_scattering (2017), demo.cc.
@@ -60,7 +61,7 @@ def at_wavelengths(atmosphere: Atmosphere, wavelengths_nm: Any) -> Atmosphere:
 
     document = atmosphere.to_dict()
     document["wavelengths_nm"] = nm.tolist()
-    document["solar_irradiance"] = SpectralBasis.of(atmosphere).sun(nm).tolist()
+    document["solar_irradiance"] = _sunlight(atmosphere, nm).tolist()
     document["ground_albedo"] = linear(atmosphere.ground_albedo)
     if atmosphere.rayleigh is not None:
         document["rayleigh"]["scattering_per_m"] = like(atmosphere.rayleigh.scattering_per_m, rayleigh_shape)
@@ -77,3 +78,17 @@ def at_wavelengths(atmosphere: Atmosphere, wavelengths_nm: Any) -> Atmosphere:
         if isinstance(g, list):
             described["phase"]["g"] = linear(np.asarray(g))
     return Atmosphere(document)
+
+
+def _sunlight(atmosphere: Atmosphere, nm: np.ndarray) -> np.ndarray:
+    own, given = atmosphere.wavelengths_nm, atmosphere.solar_irradiance
+    if np.ptp(given) == 0.0:
+        return np.full(nm.shape, given[0])
+    reference = solar_irradiance(own)
+    if not np.all(reference > 0.0):  # no shape is known there
+        order = np.argsort(own)
+        return np.interp(nm, own[order], given[order])
+    sunlight = solar_irradiance(nm) * np.mean(given / reference)
+    for value, at in zip(given, own, strict=True):
+        sunlight[nm == at] = value
+    return sunlight
