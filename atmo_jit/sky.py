@@ -55,10 +55,11 @@ class _Band:
         orders: int | None,
         tolerance: float,
         suns: tuple[float, float] | None,
+        layout: Atmosphere,
         held: dict[str, Any] | None = None,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(atmosphere, resolution, suns)
+        grid = Grid.of(layout, resolution, suns)
         if held is None:
             self.columns = sun_columns(self.optics, grid)
             self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
@@ -74,8 +75,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``held``: the solution itself, as :attr:`held` gave it for the
-    same arguments; nothing is solved then. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
+    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    :attr:`held` gave it for the same arguments; nothing is solved then. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -85,9 +87,11 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        layout: Atmosphere | None = None,
         held: list[dict[str, Any]] | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
@@ -98,7 +102,7 @@ class Sky:
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
         some = held or [None] * len(bands)
         self._bands = [
-            _Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, values)
+            _Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, layout, values)
             for band, values in zip(bands, some, strict=True)
         ]
 
