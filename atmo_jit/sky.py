@@ -19,7 +19,7 @@ import numpy as np
 
 from . import __version__
 from .atmosphere import Atmosphere
-from .backend import doubles, floats, types
+from .backend import doubles, floats, types, uints
 from .bundle import Bundle
 from .column import SunColumns, sun_columns
 from .errors import InputError
@@ -30,7 +30,7 @@ from .multiple_scattering import solve
 from .optics import MAX_CHANNELS, Optics
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
-from .views import check_views
+from .views import check_views, side_by_side
 
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
@@ -42,6 +42,15 @@ class RayLight:
 
     radiance: list[Any]
     transmittance: list[Any]
+
+    def taken(self, places: np.ndarray) -> RayLight:
+        """The rays at ``places`` of these."""
+        index = uints(places)
+
+        def take(values: list[Any]) -> list[Any]:
+            return [v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values]
+
+        return RayLight(take(self.radiance), take(self.transmittance))
 
 
 class _Band:
@@ -131,11 +140,18 @@ class Sky:
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
-        Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too).
+        Angles in radians, arrays of one width: NumPy's, which are reordered for speed, or Dr.Jit's (Float64 keeps
+        views from far out in space exact; Float works too).
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun).
         """
+        given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
+        if all(isinstance(v, np.ndarray) and v.shape == (len(given[0]),) for v in given):
+            air = self.atmosphere
+            order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
+            light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
+            return light.taken(np.argsort(order))
         rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
@@ -347,11 +363,10 @@ def _march(
 
 def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_disc: bool) -> list[np.ndarray]:
     """The four arrays of a SkyResult for some of its views."""
-    altitude = doubles(views["altitude_m"])
-    angles = [doubles(np.deg2rad(views[name])) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
-    distance = doubles(views["distance_m"]) if "distance_m" in views else None
-    light = solved.rays(altitude, *angles, distance, ground=ground, sun_disc=sun_disc)
-    sun, scattered = solved.irradiance(altitude, angles[0])
+    altitude = views["altitude_m"]
+    angles = [np.deg2rad(views[name]) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
+    light = solved.rays(altitude, *angles, views.get("distance_m"), ground=ground, sun_disc=sun_disc)
+    sun, scattered = solved.irradiance(doubles(altitude), doubles(angles[0]))
     groups = (light.radiance, light.transmittance, sun, scattered)
     dr.eval(groups)
     shape = views["altitude_m"].shape
