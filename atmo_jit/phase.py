@@ -107,7 +107,7 @@ class CornetteShanks(_OneParameter):
     type = "cornette_shanks"
 
     def _density(self, nu: Any, g: Any) -> Any:
-        return 1.5 * (1.0 + nu * nu) / (2.0 + g * g) * _henyey_greenstein(nu, g)
+        return 1.5 / (2.0 + g * g) * (1.0 + nu * nu) * _henyey_greenstein(nu, g)
 
     def _moments(self, order: int) -> list[Any]:
         peak = _powers(self.g, order + 2)
@@ -301,7 +301,8 @@ def _henyey_greenstein(nu: Any, g: Any) -> Any:
         sign = float(sign)
     size = sign * g
     squared = (1.0 - size) * (1.0 - size) + 2.0 * size * (1.0 - sign * nu)
-    return 0.25 / math.pi * (1.0 - g * g) / (squared * xp.sqrt(squared))
+    root = 1.0 / np.sqrt(squared) if xp is np else xp.rsqrt(squared)
+    return 0.25 / math.pi * (1.0 - g * g) * (root * root * root)
 
 
 def _powers(g: Any, order: int) -> list[Any]:
