@@ -15,34 +15,41 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
-from ..backend import floats, packet, types
+from ..backend import packet, stored, types
 
 TWIST_BITS, SLOPE_BITS = 12, 16  # of v_xy in the first word, of v_y in the second
 
 
 class Cells:
-    """Cells between nodes ``values`` [rows, columns, N], in sheets of ``sheets`` rows that are not joined.
+    """Cells between nodes [rows, columns] whose ``values`` are N Floats, in sheets of ``sheets`` rows that are not
+    joined.
 
     Cells after the last node of a row or column are constant, for coordinates that rounding takes there.
     """
 
-    def __init__(self, values: np.ndarray, sheets: tuple[int, ...]) -> None:
-        *_, self.columns, self.count = values.shape
+    def __init__(self, values: list[Any], columns: int, sheets: tuple[int, ...]) -> None:
+        t = types()
+        self.columns, self.count = columns, len(values)
         self._stored = 1 << (self.count - 1).bit_length()
-        v = np.zeros((*values.shape[:2], self._stored), np.float32)
-        v[..., : self.count] = values
-        by_column = np.zeros_like(v)
-        np.subtract(v[:, 1:], v[:, :-1], out=by_column[:, :-1])
-        by_row, by_both = (np.zeros_like(v) for _ in range(2))
-        last = np.cumsum(sheets) - 1
-        for of, by in ((v, by_row), (by_column, by_both)):
-            np.subtract(of[1:], of[:-1], out=by[:-1])
-            by[last] = 0.0
-        words = np.concatenate([packed(v, by_both, TWIST_BITS), packed(by_column, by_row, SLOPE_BITS)], axis=-1)
-        self._words = floats(words)
-        self.nbytes = words.nbytes
+        lane = dr.arange(t.UInt, sum(sheets) * columns)
+        nodes = stored(values, lane, self._stored)
+        row, column = lane // columns, lane % columns
+        # The last row of a sheet is its own neighbour.
+        end, last = 0, dr.zeros(t.Bool, 1)
+        for rows in sheets:
+            end += rows
+            last |= row == end - 1
+        below = dr.select(last, 0, t.UInt(columns))
+        right = dr.select(column == columns - 1, 0, t.UInt(1))
+        corners = [packet(nodes, lane + step, self._stored) for step in (0, right, below, below + right)]
+        first, second = [], []
+        for v, at_right, at_below, at_both in zip(*corners, strict=True):
+            v_x, v_y = at_right - v, at_below - v
+            first.append(packed(v, at_both - at_below - v_x, TWIST_BITS))
+            second.append(packed(v_x, v_y, SLOPE_BITS))
+        self._words = stored(first + second, lane, 2 * self._stored)
+        self.nbytes = 4 * dr.width(self._words)
 
     def at(self, row: Any, y: Any, column: Any, x: Any) -> list[Any]:
         """The N values at the fractions ``y``, ``x`` of the cell that begins at node ``row``, ``column`` (Ints)."""
@@ -55,14 +62,14 @@ class Cells:
         return found
 
 
-def packed(first: np.ndarray, second: np.ndarray, bits: int) -> np.ndarray:
-    """Floats near ``first`` whose last ``bits`` bits are the first bits of floats near ``second``, float32."""
-    low = (second.view(np.uint32).astype(np.int64) + (1 << (31 - bits))) >> (32 - bits)
-    word = first.view(np.uint32).astype(np.int64)
-    size = word & 0x7FFFFFFF
+def packed(first: Any, second: Any, bits: int) -> Any:
+    """Floats near ``first`` whose last ``bits`` bits are the first bits of floats near ``second``."""
+    t = types()
+    low = t.Int((dr.reinterpret_array(t.UInt, second) + (1 << (31 - bits))) >> (32 - bits))
+    word = dr.reinterpret_array(t.Int, first)
     # Of all floats with these last bits the nearest, in size: integers order floats.
-    size = np.maximum(size - low + (1 << (bits - 1)), 0) >> bits << bits | low
-    return (size | word & 0x80000000).astype(np.uint32).view(np.float32)
+    size = dr.maximum((word & 0x7FFFFFFF) - low + (1 << (bits - 1)), 0) >> bits << bits | low
+    return dr.reinterpret_array(t.Float, size | word & t.Int(-0x80000000))
 
 
 def last_bits(word: Any, bits: int) -> Any:

@@ -20,10 +20,10 @@ import drjit as dr
 import numpy as np
 
 from .. import mapping
-from ..backend import channels, floats, packet, padded, parameter, types, uints
+from ..backend import floats, packet, padded, parameter, stored, types, uints
 from ..phase import Isotropic, RayleighPhase
 from .cells import Cells
-from .mean_source import MeanSource, view_cosines, view_range
+from .mean_source import MeanSource, Series, view_cosines, view_range
 from .sightlines import Sightlines
 from .sunlight import Sunlight
 
@@ -66,12 +66,13 @@ class Nodes:
 
 @dataclass
 class NodeLight:
-    """Light at the nodes of a table, arrays [rows, columns, C]: ``smooth`` without the single scattering of peaked
-    scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance`` [rows, C]."""
+    """Light at the nodes of a table, a Float [rows x columns] per channel: ``smooth`` without the single scattering of
+    peaked scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance``: a Float
+    [rows] per channel."""
 
-    smooth: np.ndarray
-    peaks: dict[int, np.ndarray]
-    transmittance: np.ndarray
+    smooth: list[Any]
+    peaks: dict[int, list[Any]]
+    transmittance: list[Any]
 
 
 class SkyView:
@@ -116,7 +117,7 @@ class SkyView:
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
         light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
-        self._bands = [_Table.of(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
+        self._bands = [_Table(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
 
     def radiance(self, view_zenith: Any, azimuth: Any) -> list[Any]:
         """W Floats: radiance toward views at these angles (rad), ``azimuth`` from the sun's."""
@@ -165,39 +166,27 @@ class SkyView:
 class _Table:
     """One band's cells and the rows of its transmittance."""
 
-    @classmethod
-    def of(cls, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> _Table:
-        """Peaks taken apart, as the module says."""
-        values, colours, greys = light.smooth, [], []
-        nu = floats(nodes.nu)
-        for k, single in light.peaks.items():
-            phase = optics.phase_values(k, nu)
-            dr.eval(phase)
-            value = np.stack([np.broadcast_to(p.numpy(), nodes.nu.size) for p in phase], axis=-1)
-            grey = single.mean(axis=-1)
-            in_sun = single[nodes.sun_row, 0]
-            colour = in_sun / in_sun.mean() if in_sun.mean() > 0.0 else np.zeros_like(in_sun)
-            values = values + (single - grey[..., None] * colour) * value.reshape(single.shape)
-            colours.append(channels(colour))
-            greys.append(grey[..., None])
-        values = np.concatenate([values, *greys], axis=-1)
-        return cls(optics, values, size, list(light.peaks), colours, light.transmittance)
-
-    def __init__(
-        self,
-        optics: Any,
-        values: np.ndarray,
-        size: tuple[int, int, int],
-        peaks: list[int],
-        colours: list[list[Any]],
-        transmittance: np.ndarray,
-    ) -> None:
-        self.optics, self.peaks, self.colours = optics, peaks, colours
+    def __init__(self, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> None:
+        self.optics, self.peaks = optics, list(light.peaks)
         self.channels = optics.channel_count
-        self.up, self.down, _ = size
-        self.cells = Cells(values, (self.up, self.down))
-        extra = ((0, 0), (0, padded(self.channels) - self.channels))
-        self.rows = floats(np.pad(transmittance, extra))
+        self.up, self.down, columns = size
+        values, self.colours, greys = light.smooth, [], []
+        nu = floats(nodes.nu)
+        # Peaks taken apart, as the module says.
+        toward_sun = uints([nodes.sun_row * columns])
+        for k, single in light.peaks.items():
+            grey = sum(single) / self.channels
+            in_sun = [dr.gather(types().Float, v, toward_sun) for v in single]
+            mean = dr.maximum(sum(in_sun) / self.channels, 1e-30)
+            colour = [v / mean for v in in_sun]
+            parts = zip(values, single, colour, optics.phase_values(k, nu), strict=True)
+            values = [dr.fma(s - grey * shade, phase, v) for v, s, shade, phase in parts]
+            self.colours.append(colour)
+            greys.append(grey)
+        self.cells = Cells([*values, *greys], columns, (self.up, self.down))
+        lane = dr.arange(types().UInt, self.up + self.down)
+        self.rows = stored(light.transmittance, lane, padded(self.channels))
+        dr.eval(self.colours)
         self.nbytes = self.cells.nbytes + 4 * dr.width(self.rows)
 
     def _row(self, up: Any, row: Any) -> tuple[Any, Any]:
@@ -234,28 +223,28 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
     sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
     sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
     nu = lines.nu(ray, sun, across)
-    smooth = np.zeros((*shape, optics.channel_count))
-    if ground:  # only rows below the horizon meet it
-        below = np.flatnonzero(~nodes.up)
-        glow_ray = uints(np.repeat(below, shape[1]))
-        glow_across = floats(np.broadcast_to(sin_s * nodes.cos_phi, (len(below), shape[1])))
-        glow = lines.ground_light(band, glow_ray, floats(np.full(glow_across.shape[0], nodes.mu_s)), glow_across)
-        smooth[below] = channels_last(glow, (len(below), shape[1]))
+    smooth = [dr.zeros(types().Float, dr.width(ray)) for _ in range(optics.channel_count)]
+    if ground:  # only rows below the horizon meet it; they are the last
+        first = int(np.count_nonzero(nodes.up)) * shape[1]
+        below = dr.arange(types().UInt, first, dr.width(ray))
+        parts = (dr.gather(type(v), v, below) for v in (ray, sun, across))
+        for v, glow in zip(smooth, lines.ground_light(band, *parts), strict=True):
+            dr.scatter(v, glow, below)
     if band.source is not None:
         whole = lines.scattering.reshape(1, *lines.scattering.shape)
         source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))
-        series = source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0]
-        m = np.arange(series.shape[1])[:, None]
-        smooth = smooth + np.einsum("vmc,mp->vpc", series, np.cos(m * np.arccos(np.clip(nodes.cos_phi, -1.0, 1.0))))
+        series = Series(source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0])
+        more = series.at(ray, floats(np.broadcast_to(nodes.cos_phi, shape)))
+        smooth = [v + m for v, m in zip(smooth, more, strict=True)]
     peaks = {}
     singles = lines.single(Sunlight(optics, band.columns), ray, sun, across, nu) if optics.scatterers else []
     for k, single in zip(optics.scatterers, singles, strict=True):
         if is_peaked(optics.constituents[k]):
-            peaks[k] = channels_last(single, shape)
+            peaks[k] = single
         else:
-            values = zip(single, optics.phase_values(k, nu), strict=True)
-            smooth = smooth + channels_last([s * p for s, p in values], shape)
-    return NodeLight(smooth, peaks, lines.transmittance)
+            values = zip(single, optics.phase_values(k, nu), smooth, strict=True)
+            smooth = [dr.fma(s, p, v) for s, p, v in values]
+    return NodeLight(smooth, peaks, [floats(c) for c in lines.transmittance.T])
 
 
 def is_peaked(constituent: Any) -> bool:

@@ -106,12 +106,12 @@ class Tables4D:
         if ground:
             glow = ground_light(optics, band.band.columns, rays, band.band.field)
             smooth = [dr.fma(v, g, s) for v, g, s in zip(through, glow, smooth, strict=True)]
-        dr.eval(smooth, peaks, through)
         kinds = [optics.scatterers[n] for n in band.peaks]
+        first = dr.arange(types().UInt, rows) * columns
         return NodeLight(
-            channels_last(smooth, nodes.shape),
-            {k: channels_last(light, nodes.shape) for k, light in zip(kinds, peaks, strict=True)},
-            channels_last(through, nodes.shape)[:, 0],
+            smooth,
+            dict(zip(kinds, peaks, strict=True)),
+            [dr.gather(types().Float, v, first) for v in through],
         )
 
     @property
