@@ -66,7 +66,7 @@ class Sightlines:
         self.scattering = sums(weight.sum(axis=1), at.first)
         self._gather_stretches(at, weight, stretches)
         self._nodes, self._first_node, self._ends = at.table, at.first_node, rays.ends
-        self._weights = _padded_channels(weight.reshape(-1, *weight.shape[2:]))
+        self._weights = _padded_channels(weight.reshape(weight.shape[0] * nodes, *weight.shape[2:]))
         through = np.where(self.ground[:, None], self.transmittance, 0.0)
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
 

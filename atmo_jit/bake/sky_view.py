@@ -99,8 +99,8 @@ class SkyView:
         # Below the horizon light changes with the distance to the ground, and so on the scale of the horizon's dip.
         # Rows crowd up to the geometric middle of that and the whole half. A node lies where their density changes.
         dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
-        place = float(np.clip(1.2 * np.sqrt(dip), *CROWDED))
-        knee = max(round((0.4 + 0.6 * place) * (down_count - 1)) / (down_count - 1), place)
+        place = float(np.clip(1.4 * np.sqrt(dip), *CROWDED))
+        knee = max(round((0.35 + 0.65 * place) * (down_count - 1)) / (down_count - 1), place)
         below = mapping.crowded_inverse(mapping.texels(down_count), place, knee)
         x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
         up = np.arange(len(x)) < up_count
