@@ -230,6 +230,7 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
         parts = (dr.gather(type(v), v, below) for v in (ray, sun, across))
         for v, glow in zip(smooth, lines.ground_light(band, *parts), strict=True):
             dr.scatter(v, glow, below)
+        dr.eval(smooth)
     if band.source is not None:
         whole = lines.scattering.reshape(1, *lines.scattering.shape)
         source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))

@@ -117,6 +117,7 @@ class Tables4D:
             glow = ground_light(optics, band.band.columns, rays_from(first), band.band.field)
             for s, v, g in zip(smooth, through, glow, strict=True):
                 dr.scatter(s, dr.fma(dr.gather(t.Float, v, below), g, dr.gather(t.Float, s, below)), below)
+            dr.eval(smooth)
         kinds = [optics.scatterers[n] for n in band.peaks]
         row = dr.arange(t.UInt, rows) * columns
         return NodeLight(
