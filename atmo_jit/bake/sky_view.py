@@ -27,7 +27,7 @@ from .mean_source import MeanSource, Series, view_cosines, view_range
 from .sightlines import Sightlines
 from .sunlight import Sunlight
 
-SIZE = (96, 64, 64)  # rows above the horizon, rows below, columns
+SIZE = (96, 80, 64)  # rows above the horizon, rows below, columns
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 CROWDED = (0.1, 0.9)  # unit latitude below which rows crowd: of an observer some centimetres above the ground, far up
@@ -100,7 +100,7 @@ class SkyView:
         # Rows crowd up to the geometric middle of that and the whole half. A node lies where their density changes.
         dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
         place = float(np.clip(1.4 * np.sqrt(dip), *CROWDED))
-        knee = max(round((0.35 + 0.65 * place) * (down_count - 1)) / (down_count - 1), place)
+        knee = max(round((0.45 + 0.55 * place) * (down_count - 1)) / (down_count - 1), place)
         below = mapping.crowded_inverse(mapping.texels(down_count), place, knee)
         x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
         up = np.arange(len(x)) < up_count
