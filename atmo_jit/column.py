@@ -35,10 +35,11 @@ class SunColumns:
     """Table of mean densities over altitude and mu in [0, 1] (logarithmic from the horizontal); bilinear.
 
     ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} -
-    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
+    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R). ``table``:
+    the numbers, where they are known already.
     """
 
-    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128)) -> None:
+    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128), table: Any = None) -> None:
         self.optics = optics
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
@@ -55,7 +56,7 @@ class SunColumns:
         bounds = np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.arange(self._shells)])
         self._bounds, self._cells = floats(bounds), floats(bounds[np.clip(cell_start, 0, self._shells - 1)])
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
-        self._table = self._build() if self._count else None
+        self.table = table if table is not None else self._build() if self._count else None
 
     def _build(self) -> Any:
         t = types()
@@ -112,13 +113,13 @@ class SunColumns:
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
         corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
         if mu is None:
-            near, far = (row(self._table, corner + offset, n, active=active) for offset in (0, cosines))
+            near, far = (row(self.table, corner + offset, n, active=active) for offset in (0, cosines))
         else:
             x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
             column = dr.minimum(t.UInt(x), cosines - 2)
             fx = x - t.Float(column)
             a, b, c, d = (
-                row(self._table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
+                row(self.table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
             )
             near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
         path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)

@@ -21,8 +21,9 @@ from . import __version__
 from .atmosphere import Atmosphere
 from .backend import doubles, floats, types, uints
 from .bundle import Bundle
-from .column import sun_columns
+from .column import SunColumns, sun_columns
 from .errors import InputError
+from .field import Field
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve
@@ -63,11 +64,17 @@ class _Band:
         orders: int | None,
         tolerance: float,
         suns: tuple[float, float] | None,
+        layout: Atmosphere,
+        held: dict[str, Any] | None = None,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(atmosphere, resolution, suns)
-        self.columns = sun_columns(self.optics, grid)
-        self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
+        grid = Grid.of(layout, resolution, suns)
+        if held is None:
+            self.columns = sun_columns(self.optics, grid)
+            self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
+        else:
+            self.columns = SunColumns(self.optics, resolution.columns, held["columns"])
+            self.field = Field.of(self.optics, self.columns, grid, resolution.first_degree, held, scatters=orders != 1)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 
@@ -77,7 +84,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
+    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    :attr:`held` gave it for the same arguments; nothing is solved then. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -87,17 +96,24 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        layout: Atmosphere | None = None,
+        held: list[dict[str, Any]] | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
             raise InputError(f"tolerance: is {tolerance!r}; must be a number between 0 and 1")
-        self.orders, self.tolerance = orders, tolerance
+        self.orders, self.tolerance, self.suns = orders, tolerance, suns
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
+        some = held or [None] * len(bands)
+        self._bands = [
+            _Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, layout, values)
+            for band, values in zip(bands, some, strict=True)
+        ]
 
     @property
     def bands(self) -> list[_Band]:
@@ -105,6 +121,11 @@ class Sky:
         for band in self._bands:
             band.field.prepare()
         return self._bands
+
+    @property
+    def held(self) -> list[dict[str, Any]]:
+        """All numbers of the solution, per band: Floats by name."""
+        return [{"columns": band.columns.table, **band.field.held} for band in self._bands]
 
     def rays(
         self,
