@@ -13,6 +13,7 @@ import numpy as np
 
 from ..backend import floats, types, uints
 from ..grid import profile_key
+from ..march import MAX_TURN
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
 from .sunlight import SIZE as SUNLIGHT
@@ -97,9 +98,11 @@ class Rays:
         self._pieces: dict[bytes, Pieces] = {}
 
     def pieces(self, extinction: np.ndarray) -> Pieces:
-        """The rays cut so that the optical depth of a piece is at most MAX_DEPTH; ``extinction`` [constituent, C]."""
+        """The rays cut so that the optical depth of a piece is at most MAX_DEPTH and its turn about the planet's centre
+        MAX_TURN; ``extinction`` [constituent, C]."""
         depth = (extinction.T @ self._columns).max(axis=0, initial=0.0)
-        parts = np.clip(np.ceil(depth / MAX_DEPTH), 1, LONGEST).astype(int)
+        turn = (self._shells[2] - self._shells[1]) / self._air.bottom_radius_m
+        parts = np.clip(np.ceil(np.maximum(depth / MAX_DEPTH, turn / MAX_TURN)), 1, LONGEST).astype(int)
         key = parts.tobytes()
         if key not in self._pieces:
             self._pieces = {key: Pieces(self, *self._shells, parts)}
