@@ -147,7 +147,7 @@ class Sky:
         ``sun_angular_radius_deg`` (nothing for a point sun).
         """
         given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
-        if all(isinstance(v, np.ndarray) and v.shape == (len(given[0]),) for v in given):
+        if all(isinstance(v, np.ndarray) and v.ndim == 1 and v.size == np.size(given[0]) for v in given):
             air = self.atmosphere
             order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
             light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)

@@ -136,10 +136,8 @@ def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
             views["altitude_m"],
             *(np.radians(views[f"{k}_deg"]) for k in ("sun_zenith", "view_zenith", "azimuth")),
         ]
-        inputs = [Float(part.astype(np.float32)) for part in angles]
-        dr.eval(inputs)
 
-        def evaluate(inputs: list[Float] = inputs) -> None:
+        def evaluate(inputs: list[np.ndarray] = angles) -> None:
             dr.eval(solved.rays(*inputs).radiance)
             dr.sync_thread()
 
