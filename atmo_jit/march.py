@@ -118,6 +118,23 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     return edges
 
 
+class Shells:
+    """What a march looks up: the altitudes (m) at which it cuts, the largest extinction (1/m) between two of them, and
+    quadrature rules."""
+
+    def __init__(self, optics: Optics) -> None:
+        self.breaks = floats(optics.breaks_m)
+        self.last = parameter(len(optics.breaks_m) - 2.0)
+        self.densest = _largest_extinctions(optics, self.breaks)
+        self._rules: dict[int, Rule] = {}
+
+    def rule(self, nodes: int) -> Rule:
+        """The rule of so many nodes."""
+        if nodes not in self._rules:
+            self._rules[nodes] = Rule(nodes)
+        return self._rules[nodes]
+
+
 class Rule:
     """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW
     coarser nodes.
@@ -154,12 +171,14 @@ def march(
     nodes: int = NODES,
     single: bool = True,
     source: Source | None = None,
+    shells: Shells | None = None,
 ) -> Light:
     """Radiance scattered toward the origin of each ray, per unit of ``optics.solar``; ground light is not included.
 
     Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's
     shadow. ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the
-    centroid of the piece's weight, which is exact for a field that is linear there.
+    centroid of the piece's weight, which is exact for a field that is linear there. ``shells``: those of these
+    optics, where they cannot be made because a kernel is being traced.
     """
     t = types()
     c_count, k_count = optics.channel_count, len(optics.constituents)
@@ -167,13 +186,12 @@ def march(
     if k_count == 0:
         zero = [dr.zeros(t.Float, width) for _ in range(c_count)]
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(c_count)])
-    breaks = floats(optics.breaks_m)
-    last = parameter(len(optics.breaks_m) - 2.0)
-    densest = _largest_extinctions(optics, breaks)
+    shells = shells or Shells(optics)
+    breaks, densest, last = shells.breaks, shells.densest, shells.last
     perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
     r_mu = (optics.radius + rays.h) * rays.mu
     edges = _sunlight_edges(optics, rays) if single else []
-    rule = Rule(nodes)
+    rule = shells.rule(nodes)
     phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
