@@ -15,6 +15,7 @@ import numpy as np
 from atmo_jit.geometry import altitude_along, hits_ground
 from atmo_jit.march import NODES, Rays, Shells, march, point_along, rays_to_boundary, visible_sun
 from atmo_jit.quadrature import gauss_legendre
+from atmo_jit.resolution import moments_of
 from atmo_jit.single_scattering import disc_cosine
 from atmo_jit.sky import Sky
 
@@ -51,6 +52,8 @@ class Airlight:
         self.sky, self.globe = sky, globe
         self.bands = sky.bands
         self._shells = [Shells(band.optics) for band in self.bands]
+        # Light of one order has nothing but the sun's own beam to lose.
+        self._beams = [beam_extinction(band.optics, scaled=sky.orders != 1) for band in self.bands]
         for shells in self._shells:
             shells.rule(NODES)
             dr.eval(shells.densest)
@@ -126,7 +129,8 @@ class Airlight:
     def shade(
         self, part: Stretch, start: Any, end: Any, sample: Any, most: int, lit: Callable[[Any], Any]
     ) -> list[Any]:
-        """Single scattering (radiance, W) that is missing from a stretch because shapes keep the sun from it.
+        """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it: of order 1, and of
+        higher orders what comes from so near the sun that the same shapes are in its way (:func:`beam_extinction`).
 
         They can do so only between the distances ``start`` and ``end`` (scene units). There up to ``most`` points are
         drawn, fewer where little is scattered: one from each of as many parts of equal weight exp(-distance x
@@ -155,10 +159,11 @@ class Airlight:
             inverse_density = (1.0 - rest) / (rate * left * count)
             dark = (1.0 - lit((part.gap + there) * scale)) * visible_sun(optics, h, r, mu_s) * inverse_density
             new = []
-            for band, values in zip(self.bands, phases, strict=True):
+            for band, beam, values in zip(self.bands, self._beams, phases, strict=True):
                 o = band.optics
-                here, sun = o.densities(h), o.optical_depths(band.columns.toward(h, mu_s))
-                for c, (depth, sun_depth) in enumerate(zip(o.optical_depths(amounts), sun, strict=True)):
+                here, toward = o.densities(h), band.columns.toward(h, mu_s)
+                for c, depth in enumerate(o.optical_depths(amounts)):
+                    sun_depth = sum(e[c] * n for e, n in zip(beam, toward, strict=True))
                     scattered = sum(o.scattering[k][c] * values[k][c] * here[k] for k in o.scatterers)
                     new.append(scattered * dr.exp(-depth - sun_depth) * dark * o.solar[c])
             return i + 1.0, there, amounts, [a + b for a, b in zip(sums, new, strict=True)]
@@ -177,3 +182,20 @@ class Airlight:
                 h, _ = altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, float(x) + i, start))
                 amounts = [dr.fma(length * float(w), v, a) for v, a in zip(optics.densities(h), amounts, strict=True)]
         return amounts
+
+
+
+def beam_extinction(optics: Any, *, scaled: bool) -> list[Any]:
+    """Extinction (1/m) [constituent][channel] of what shapes take away when they shade the air: of sunlight, and,
+    ``scaled``, of the light that was scattered so little aside that the same shapes are in its way.
+
+    Of every scattering the part chi_2, the second moment of the phase function, counts as not scattered (Joseph,
+    Wiscombe and Weinman 1976)."""
+    found = []
+    for k, c in enumerate(optics.constituents):
+        forward = [0.0] * optics.channel_count
+        if scaled and c.phase is not None:
+            forward = [float(moments_of(c.phase.at(int(i)), 2)[2]) for i in optics.indices]
+        found.append([e - f * s for e, f, s in zip(optics.extinction[k], forward, optics.scattering[k], strict=True)])
+    dr.make_opaque(found)
+    return found

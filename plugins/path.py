@@ -79,10 +79,11 @@ class AtmospherePath:
     Renders any scene that has one emitter :ref:`atmosphere <emitter-atmosphere>`. Surfaces are lit by the sun, by the
     sky as it is at their own place and altitude, by each other and by the scene's other lamps; on the way from each
     surface to the next, and to the camera, the air takes its part of the light and adds what it scatters. That is
-    integrated along every segment (never a difference of two look-ups), less the light of order 1 from points that
-    the sun does not see: where a segment may be in the shadow of the box around all shapes, rays to the sun are traced
-    from some of its points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher
-    orders is that of the planet without shapes, so shadowed air is brighter than it should be by what its neighbours' shadows would take away.
+    integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
+    where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
+    points, more where it scatters more. Scenes too small for that to matter skip it. With the sun goes the light that
+    has been scattered forward, from about the sun; other light of higher orders is that of the planet without shapes,
+    so the air in a shadow is brighter than it should be (docs/accuracy.md says by how much).
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.
