@@ -24,6 +24,7 @@ from .quadrature import gauss_legendre, running_integral
 NODES = 4  # per piece
 FEW = 4  # per piece, for densities and columns, which are smooth
 MAX_DEPTH = 1.0  # optical depth of a piece: exp(-tau) over it is a polynomial of degree 7 to 1e-7
+MAX_TURN = 0.03  # radians about the planet's centre: the light that scatters again changes with the sun's height
 SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
 
 
@@ -191,7 +192,7 @@ def march(
     perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
     r_mu = (optics.radius + rays.h) * rays.mu
     edges = _sunlight_edges(optics, rays) if single else []
-    rule = shells.rule(nodes)
+    rule, farthest = shells.rule(nodes), MAX_TURN * optics.radius
     phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
@@ -207,7 +208,7 @@ def march(
                 distance_up(optics.radius, rays.h, rays.mu, target),
             ),
         )
-        limit = d + MAX_DEPTH / dr.maximum(dr.gather(t.Float, densest, t.UInt(shell)), 1e-30)
+        limit = d + dr.minimum(MAX_DEPTH / dr.maximum(dr.gather(t.Float, densest, t.UInt(shell)), 1e-30), farthest)
         end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
         for edge in edges:
             end = dr.select(edge > d, dr.minimum(end, edge), end)

@@ -19,17 +19,18 @@ import numpy as np
 
 from . import __version__
 from .atmosphere import Atmosphere
-from .backend import doubles, floats, types
+from .backend import doubles, floats, types, uints
 from .bundle import Bundle
-from .column import sun_columns
+from .column import SunColumns, sun_columns
 from .errors import InputError
+from .field import Field
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve
 from .optics import MAX_CHANNELS, Optics
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
-from .views import check_views
+from .views import check_views, side_by_side
 
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
@@ -41,6 +42,15 @@ class RayLight:
 
     radiance: list[Any]
     transmittance: list[Any]
+
+    def taken(self, places: np.ndarray) -> RayLight:
+        """The rays at ``places`` of these."""
+        index = uints(places)
+
+        def take(values: list[Any]) -> list[Any]:
+            return [v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values]
+
+        return RayLight(take(self.radiance), take(self.transmittance))
 
 
 class _Band:
@@ -54,11 +64,17 @@ class _Band:
         orders: int | None,
         tolerance: float,
         suns: tuple[float, float] | None,
+        layout: Atmosphere,
+        held: dict[str, Any] | None = None,
     ) -> None:
         self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(atmosphere, resolution, suns)
-        self.columns = sun_columns(self.optics, grid)
-        self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
+        grid = Grid.of(layout, resolution, suns)
+        if held is None:
+            self.columns = sun_columns(self.optics, grid)
+            self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
+        else:
+            self.columns = SunColumns(self.optics, resolution.columns, held["columns"])
+            self.field = Field.of(self.optics, self.columns, grid, resolution.first_degree, held, scatters=orders != 1)
         self.source = self.field if self.field.scatters and self.optics.scatterers else None
 
 
@@ -68,7 +84,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
+    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    :attr:`held` gave it for the same arguments; nothing is solved then. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -78,17 +96,24 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        layout: Atmosphere | None = None,
+        held: list[dict[str, Any]] | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
             raise InputError(f"tolerance: is {tolerance!r}; must be a number between 0 and 1")
-        self.orders, self.tolerance = orders, tolerance
+        self.orders, self.tolerance, self.suns = orders, tolerance, suns
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
+        some = held or [None] * len(bands)
+        self._bands = [
+            _Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, layout, values)
+            for band, values in zip(bands, some, strict=True)
+        ]
 
     @property
     def bands(self) -> list[_Band]:
@@ -96,6 +121,11 @@ class Sky:
         for band in self._bands:
             band.field.prepare()
         return self._bands
+
+    @property
+    def held(self) -> list[dict[str, Any]]:
+        """All numbers of the solution, per band: Floats by name."""
+        return [{"columns": band.columns.table, **band.field.held} for band in self._bands]
 
     def rays(
         self,
@@ -110,11 +140,18 @@ class Sky:
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
-        Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too).
+        Angles in radians, arrays of one width: NumPy's, which are reordered for speed, or Dr.Jit's (Float64 keeps
+        views from far out in space exact; Float works too).
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun).
         """
+        given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
+        if all(isinstance(v, np.ndarray) and v.shape == (len(given[0]),) for v in given):
+            air = self.atmosphere
+            order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
+            light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
+            return light.taken(np.argsort(order))
         rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
@@ -326,11 +363,10 @@ def _march(
 
 def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_disc: bool) -> list[np.ndarray]:
     """The four arrays of a SkyResult for some of its views."""
-    altitude = doubles(views["altitude_m"])
-    angles = [doubles(np.deg2rad(views[name])) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
-    distance = doubles(views["distance_m"]) if "distance_m" in views else None
-    light = solved.rays(altitude, *angles, distance, ground=ground, sun_disc=sun_disc)
-    sun, scattered = solved.irradiance(altitude, angles[0])
+    altitude = views["altitude_m"]
+    angles = [np.deg2rad(views[name]) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
+    light = solved.rays(altitude, *angles, views.get("distance_m"), ground=ground, sun_disc=sun_disc)
+    sun, scattered = solved.irradiance(doubles(altitude), doubles(angles[0]))
     groups = (light.radiance, light.transmittance, sun, scattered)
     dr.eval(groups)
     shape = views["altitude_m"].shape
