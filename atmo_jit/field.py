@@ -115,7 +115,12 @@ class Field:
     def _irradiances(self) -> tuple[Any, Any]:
         return self._refined(self.sky, 1), self._refined(self.reflected, 1)
 
-    def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
+    def refined_moments(self) -> np.ndarray:
+        """Moments over the reference at the nodes of look-ups, float32 [levels x suns, pairs, channels]."""
+        moments = np.array(self._tables[0], dtype=np.float32).reshape(-1, pair_count(self.degree), self._size)
+        return moments[..., : self.optics.channel_count]
+
+    def corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
         [2][channel]."""
         suns = self.grid.sources
@@ -157,7 +162,7 @@ class Field:
         t = types()
         channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
         size = padded(channels)
-        nodes, weights, scales = self._corners(h, mu_s, active)
+        nodes, weights, scales = self.corners(h, mu_s, active)
         sine = dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
         count = pair_count(self.degree)
         stride = dr.opaque(t.UInt, count, 1)

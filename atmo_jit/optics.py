@@ -113,14 +113,15 @@ class Optics:
         if degree in self.phase_tables:
             return self.phase_tables[degree]
         weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
-        chi = self._scatterers_moments(degree)
+        chi = self.scatterers_moments(degree)
         return table(_legendre_values(degree) @ (weights[:, None] * chi))
 
     def phase_moments(self, degree: int) -> Any:
         """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
-        return self.moment_tables[degree] if degree in self.moment_tables else table(self._scatterers_moments(degree))
+        return self.moment_tables[degree] if degree in self.moment_tables else table(self.scatterers_moments(degree))
 
-    def _scatterers_moments(self, degree: int) -> np.ndarray:
+    def scatterers_moments(self, degree: int) -> np.ndarray:
+        """Legendre moments chi_l of the scatterers: array [l, scatterer x channel]."""
         columns = [m for k in self.scatterers for m in self._moments(k, degree)]
         return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
 

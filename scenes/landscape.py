@@ -68,7 +68,8 @@ def mountains() -> tuple[np.ndarray, np.ndarray]:
     bend = 700.0 * np.sin(y / 5200.0) * smooth_step(y / 6000.0)
     beside = smooth_step((np.abs(x - bend) - 500.0) / 3500.0)
     end = smooth_step((y - 13e3) / 6e3)
-    height = TALLEST_M * ridges(x / 7200.0 + 3.3, y / 7200.0 + 1.7, 11, 6) * (0.04 + 0.96 * np.maximum(beside, 0.75 * end))
+    rough = ridges(x / 7200.0 + 3.3, y / 7200.0 + 1.7, 11, 6)
+    height = TALLEST_M * rough * (0.04 + 0.96 * np.maximum(beside, 0.75 * end))
     edge = np.minimum.reduce([x + 12e3, 12e3 - x, y + 4e3, 20e3 - y])
     return grid(x, y, height * smooth_step(edge / 1500.0))
 
