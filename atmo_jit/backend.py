@@ -6,7 +6,8 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
@@ -160,5 +161,60 @@ def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     out = dr.zeros(t.Float, dr.width(lane) * size)
     padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
     dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
-    dr.eval(out)
-    return out
+    return evaluated(out)
+
+
+def evaluated(buffer: Any) -> Any:
+    """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
+
+    Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
+    the process ("dirty variable").
+    """
+    import drjit as dr
+
+    if dr.grad_enabled(buffer):
+        return dr.custom(_evaluating(), buffer)
+    dr.eval(buffer)
+    return buffer
+
+
+@contextmanager
+def traversing() -> Iterator[None]:
+    """Derivatives are to be propagated through this package's kernels in such a block.
+
+    Dr.Jit 1.5 aborts the process ("dirty variable") where it sums derivatives into copies of a buffer, one per thread,
+    in a kernel with a loop; here it sums into the buffer itself.
+    """
+    import drjit as dr
+
+    threshold = dr.expand_threshold()
+    dr.set_expand_threshold(0)
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(threshold)
+
+
+@lru_cache(maxsize=1)
+def _evaluating() -> type:
+    import drjit as dr
+
+    class Evaluated(dr.CustomOp):
+        def eval(self, buffer: Any) -> Any:
+            dr.eval(buffer)
+            return buffer
+
+        def forward(self) -> None:
+            grad = self.grad_in("buffer")
+            dr.eval(grad)
+            self.set_grad_out(grad)
+
+        def backward(self) -> None:
+            grad = self.grad_out()
+            dr.eval(grad)
+            self.set_grad_in("buffer", grad)
+
+        def name(self) -> str:
+            return "evaluated"
+
+    return Evaluated

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, row, stored, types, uints
+from .backend import evaluated, floats, packet, padded, row, stored, types, uints
 from .column import SunColumns
 from .grid import Grid, split
 from .harmonics import pair_count, pairs, recurrence
@@ -210,5 +210,4 @@ def _between_levels(grid: Grid, values: Any, length: int) -> Any:
     for i in range(count):
         value = dr.gather(t.Float, values, (start + i) * length + place)
         total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
-    dr.eval(total)
-    return total
+    return evaluated(total)

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, stored, types, uints
+from .backend import evaluated, floats, packet, stored, types, uints
 from .grid import Grid
 from .harmonics import legendre, pair_count, pairs
 from .paths import Directions
@@ -32,9 +32,7 @@ def stored_harmonics(sums: list[Any], azimuths: int) -> Any:
     channel, rays, suns], evaluated."""
     t = types()
     share = dr.opaque(t.Float, 2.0 * np.pi / azimuths, 1)
-    out = dr.ravel(t.ArrayXf([share * s for s in sums]), order="C")
-    dr.eval(out)
-    return out
+    return evaluated(dr.ravel(t.ArrayXf([share * s for s in sums]), order="C"))
 
 
 def room(suns: int) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, row, row_size, table_of, types, uints
+from .backend import evaluated, floats, row, row_size, table_of, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pair_index, pairs
@@ -69,8 +69,7 @@ def _sum(
         taps = Taps(grid, t.Float(sun) / grid.first, few)
         values = [dr.gather(t.Float, later, ((k * few + at) * entries + entry) * channels + channel) for at in taps.at]
         total = total + taps.sum(values, dr.gather(t.Float, parity(grid, first.degree), start + entry))
-    dr.eval(total)
-    return total
+    return evaluated(total)
 
 
 def _rest(
@@ -106,8 +105,7 @@ def _rest(
             value = dr.select(held, value, sharp * more * dr.gather(t.Float, fading, entry * channels + channel))
         total = dr.fma(value, weight, total)
     total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    dr.eval(total)
-    return total
+    return evaluated(total)
 
 
 def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: int) -> tuple[Any, Any]:
@@ -157,8 +155,7 @@ def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: in
             power = power * quotient
         values.append(power)
     fading = dr.ravel(t.ArrayXf(values), order="F")
-    dr.eval(size, fading)
-    return size, fading
+    return evaluated(size), evaluated(fading)
 
 
 def _degrees(grid: Grid, degree: int) -> Any:
@@ -199,11 +196,9 @@ def _over(grid: Grid, irradiance: Any, per_depth: Any, channels: int) -> Any:
     altitudes, width = grid.shape[0], len(grid.first_theta) * channels
     lane = dr.arange(t.UInt, altitudes * width)
     quotient = irradiance * dr.gather(t.Float, per_depth, lane // width * row_size(channels) + lane % channels)
-    dr.eval(quotient)
+    quotient = evaluated(quotient)
     # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
     end = altitudes * width - width + lane % width
     near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * width), 1e-30) for n in (1, 2))
     steady = near * dr.clip(near / far, 0.25, 4.0)
-    quotient = dr.select(lane >= (altitudes - 1) * width, steady, quotient)
-    dr.eval(quotient)
-    return quotient
+    return evaluated(dr.select(lane >= (altitudes - 1) * width, steady, quotient))
