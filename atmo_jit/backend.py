@@ -105,11 +105,6 @@ def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]
     return [values[i] for i in range(count)]
 
 
-def channels(values: Sequence[Any]) -> list[Any]:
-    """A list of opaque parameters, one per entry."""
-    return [parameter(v) for v in values]
-
-
 def padded(channel_count: int) -> int:
     """Floats stored per entry of a table: a packet load wants a power of two."""
     return 4 if channel_count == 3 else channel_count

@@ -146,6 +146,46 @@ class Rule:
         return total
 
 
+class Cuts:
+    """Where rays are cut into pieces."""
+
+    def __init__(self, optics: Optics, rays: Rays, *, sunlit: bool = True) -> None:
+        self._optics, self._rays = optics, rays
+        self._breaks = floats(optics.breaks_m)
+        self._last = parameter(len(optics.breaks_m) - 2.0)
+        self._densest = _largest_extinctions(optics, self._breaks)
+        self._perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
+        self._r_mu = (optics.radius + rays.h) * rays.mu
+        self._edges = _sunlight_edges(optics, rays) if sunlit else []
+
+    def first_shell(self) -> Any:
+        """The shell that each ray starts in."""
+        return _first_shell(self._optics, self._rays, self._breaks, self._last)
+
+    def after(self, d: Any, shell: Any) -> tuple[Any, Any]:
+        """Distance to the end of the piece that starts at ``d`` in ``shell``, and the shell after it."""
+        t, rays, radius, breaks = types(), self._rays, self._optics.radius, self._breaks
+        falling = self._r_mu + d < 0.0
+        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
+        bottoms_out = falling & (target <= self._perigee)
+        crossing = dr.select(
+            bottoms_out,
+            -self._r_mu,
+            dr.select(
+                falling,
+                distance_down(radius, rays.h, rays.mu, target),
+                distance_up(radius, rays.h, rays.mu, target),
+            ),
+        )
+        limit = d + MAX_DEPTH / dr.maximum(dr.gather(t.Float, self._densest, t.UInt(shell)), 1e-30)
+        end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
+        for edge in self._edges:
+            end = dr.select(edge > d, dr.minimum(end, edge), end)
+        passed = (end >= crossing) & ~bottoms_out
+        step = dr.select(falling, -1.0, 1.0)
+        return end, dr.select(passed, dr.clip(shell + step, 0.0, self._last), shell)
+
+
 def march(
     optics: Optics,
     columns: SunColumns,
@@ -167,32 +207,12 @@ def march(
     if k_count == 0:
         zero = [dr.zeros(t.Float, width) for _ in range(c_count)]
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(c_count)])
-    breaks = floats(optics.breaks_m)
-    last = parameter(len(optics.breaks_m) - 2.0)
-    densest = _largest_extinctions(optics, breaks)
-    perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
-    r_mu = (optics.radius + rays.h) * rays.mu
-    edges = _sunlight_edges(optics, rays) if single else []
+    cuts, r_mu = Cuts(optics, rays, sunlit=single), (optics.radius + rays.h) * rays.mu
     rule = Rule(nodes)
     phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
-        falling = r_mu + d < 0.0
-        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
-        bottoms_out = falling & (target <= perigee)
-        crossing = dr.select(
-            bottoms_out,
-            -r_mu,
-            dr.select(
-                falling,
-                distance_down(optics.radius, rays.h, rays.mu, target),
-                distance_up(optics.radius, rays.h, rays.mu, target),
-            ),
-        )
-        limit = d + MAX_DEPTH / dr.maximum(dr.gather(t.Float, densest, t.UInt(shell)), 1e-30)
-        end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
-        for edge in edges:
-            end = dr.select(edge > d, dr.minimum(end, edge), end)
+        end, shell = cuts.after(d, shell)
         length = end - d
 
         density = [
@@ -237,30 +257,32 @@ def march(
 
         for k in range(k_count):
             amounts[k] = dr.fma(length, rule.sum(rule.few_w, density, k), amounts[k])
-        crossed = end >= crossing
-        shell = dr.select(crossed & ~bottoms_out, dr.clip(shell + dr.select(falling, -1.0, 1.0), 0.0, last), shell)
         return end, shell, amounts, one, more
-
-    def unfinished(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> Any:
-        depths = optics.optical_depths(amounts)
-        thinnest = depths[0]
-        for depth in depths[1:]:
-            thinnest = dr.minimum(thinnest, depth)
-        return (d < rays.stop) & (thinnest < SPENT_DEPTH)
 
     state = (
         dr.zeros(t.Float, width),
-        _first_shell(optics, rays, breaks, last),
+        cuts.first_shell(),
         [dr.zeros(t.Float, width) for _ in range(k_count)],
         [dr.zeros(t.Float, width) for _ in range(c_count)],
         [dr.zeros(t.Float, width) for _ in range(c_count)],
     )
-    _, _, amounts, one, more = dr.while_loop(state, unfinished, piece, label="march")
+    _, _, amounts, one, more = dr.while_loop(
+        state, lambda d, _, amounts, *__: unfinished(optics, rays, d, amounts), piece, label="march"
+    )
     return Light(
         [radiance * solar for radiance, solar in zip(one, optics.solar, strict=True)],
         more,
         [dr.exp(-depth) for depth in optics.optical_depths(amounts)],
     )
+
+
+def unfinished(optics: Optics, rays: Rays, d: Any, amounts: list[Any]) -> Any:
+    """Whether anything is to be seen beyond the distance ``d``, ``amounts`` of matter (m) away."""
+    depths = optics.optical_depths(amounts)
+    thinnest = depths[0]
+    for depth in depths[1:]:
+        thinnest = dr.minimum(thinnest, depth)
+    return (d < rays.stop) & (thinnest < SPENT_DEPTH)
 
 
 def relative_azimuth(mu: Any, mu_s: Any, nu: Any) -> Any:

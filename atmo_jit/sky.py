@@ -10,7 +10,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from copy import copy
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -21,12 +22,14 @@ from . import __version__
 from .atmosphere import Atmosphere
 from .backend import doubles, floats, types
 from .bundle import Bundle
-from .column import sun_columns
+from .column import SunColumns, sun_columns
 from .errors import InputError
+from .field import Field
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
-from .multiple_scattering import solve
+from .multiple_scattering import solve, solve_again
 from .optics import MAX_CHANNELS, Optics
+from .pieces import Pieces, light_along
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views
@@ -46,20 +49,9 @@ class RayLight:
 class _Band:
     """The solution at up to four wavelengths."""
 
-    def __init__(
-        self,
-        atmosphere: Atmosphere,
-        indices: np.ndarray,
-        resolution: Resolution,
-        orders: int | None,
-        tolerance: float,
-        suns: tuple[float, float] | None,
-    ) -> None:
-        self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(atmosphere, resolution, suns)
-        self.columns = sun_columns(self.optics, grid)
-        self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
-        self.source = self.field if self.field.scatters and self.optics.scatterers else None
+    def __init__(self, optics: Optics, columns: SunColumns, field: Field) -> None:
+        self.optics, self.columns, self.field = optics, columns, field
+        self.source = field if field.scatters and optics.scatterers else None
 
 
 class Sky:
@@ -68,7 +60,8 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: a tenth of the orders'
+    usual remainder is left out, for derivatives. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -78,6 +71,9 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        *,
+        scattering_too: Collection[str] = (),
+        sure: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
@@ -87,8 +83,29 @@ class Sky:
         self.orders, self.tolerance = orders, tolerance
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
-        bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        self._bands = [_Band(self.atmosphere, band, self.resolution, orders, tolerance, suns) for band in bands]
+        self._suns = suns
+        self._bands: list[_Band] = []
+        for i in range(0, count, MAX_CHANNELS):
+            optics = Optics(self.atmosphere, np.arange(i, min(i + MAX_CHANNELS, count)), scattering_too)
+            columns = sun_columns(optics, self.grid)
+            field = solve(optics, columns, self.grid, self.resolution, orders, 0.1 * tolerance if sure else tolerance)
+            self._bands.append(_Band(optics, columns, field))
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes that it is solved on."""
+        return Grid.of(self.atmosphere, self.resolution, self._suns)
+
+    def again(self, values: list[dict[str, Any]]) -> Sky:
+        """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives: as many orders, on
+        the same nodes."""
+        other, other._bands = copy(self), []
+        for band, new in zip(self._bands, values, strict=True):
+            optics = band.optics.with_values(new)
+            columns = sun_columns(optics, self.grid)
+            field = solve_again(optics, columns, self.grid, self.resolution, band.field.shares, self.orders)
+            other._bands.append(_Band(field.optics, columns, field))
+        return other
 
     @property
     def bands(self) -> list[_Band]:
@@ -107,21 +124,26 @@ class Sky:
         *,
         ground: bool = True,
         sun_disc: bool = False,
+        pieces: list[Pieces | None] | None = None,
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
         Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too).
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
-        ``sun_angular_radius_deg`` (nothing for a point sun).
+        ``sun_angular_radius_deg`` (nothing for a point sun). ``pieces``: those of the rays (pieces.Pieces), per band;
+        derivatives then pass through.
         """
         rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
-        for band in self._bands:
+        for i, band in enumerate(self._bands):
             optics = band.optics
             band.field.prepare()
-            light = march(optics, band.columns, rays, source=band.source)
+            if pieces is None:
+                light = march(optics, band.columns, rays, source=band.source)
+            else:
+                light = light_along(optics, band.columns, rays, pieces[i], source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
                 light.single[c] = light.single[c] + light.multiple[c]

@@ -15,6 +15,10 @@ from .optics import Optics
 from .projection import Moments
 from .refinement import Reference, Taps
 
+# Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
+# derivative of a quotient, which has a square below the line, must not leave single precision.
+DARK = 1e-16
+
 
 def total_of(
     optics: Optics,
@@ -34,7 +38,7 @@ def total_of(
     entries = pair_count(first.degree)
     per_depth = _per_depth(optics, columns, grid)
     peaks = [
-        _peak(optics, grid, first, order, n) if order.entries < first.entries else None
+        _peak(optics, grid, reference, first, order, n) if order.entries < first.entries else None
         for n, order in enumerate(rest, 1)
     ]
     return (
@@ -108,7 +112,9 @@ def _rest(
     return evaluated(total)
 
 
-def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: int) -> tuple[Any, Any]:
+def _peak(
+    optics: Optics, grid: Grid, reference: Reference, first: Moments, order: Moments, events: int
+) -> tuple[Any, Any]:
     """Forward peak of an order beyond the moments that it has, as a part of order 1: (size [l, K, S, channels], fading
     [entries, channels]).
 
@@ -127,18 +133,20 @@ def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: in
     sun, node = node % suns, node // suns
     k, l_ = node % altitudes, node // altitudes
     product, square = 0.0, 0.0
+    scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
     for m in range(min(order.most, 1), order.most + 1):
         held = l_ >= m
         # Places of (l, m) are consecutive in l.
         a, b = (
-            dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
+            scale * dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
             for light, there, start in (
                 (first, sun * grid.first, pair_index(first.degree, m, m)),
                 (order, sun, pair_index(order.degree, m, m)),
             )
         )
         product, square = dr.fma(a, b, product), dr.fma(a, a, square)
-    size = dr.select(square > 0.0, dr.maximum(product, 0.0) / dr.select(square > 0.0, square, 1.0), 0.0)
+    lit = square > DARK
+    size = dr.select(lit, dr.maximum(product, 0.0) / dr.select(lit, square, 1.0), 0.0)
 
     l_ = _degrees(grid, first.degree)
     moments = optics.phase_moments(first.degree + 1)
