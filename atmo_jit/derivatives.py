@@ -20,7 +20,7 @@ import numpy as np
 from .atmosphere import Atmosphere
 from .backend import doubles, traversing, types
 from .optics import on_device
-from .parameters import RADII, VIEWS, check_names, directions, flat, like, tangent
+from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, tangent
 from .pieces import Pieces
 from .sky import Sky
 from .views import check_views
@@ -67,7 +67,7 @@ class Linearization:
         Where the description has one number per wavelength, entry [i, w] is by the number of wavelength w: no other
         matters there. Angles of views are in degrees, as their names say. Raises InputError for an unknown name.
         """
-        names = check_names(self.atmosphere, names)
+        names = check_names(self.atmosphere, names, self.views)
         seeds = [
             (name, direction)
             for name in names
@@ -82,6 +82,20 @@ class Linearization:
         return {
             name: np.stack(parts, axis=-1) if ".profile." in name else parts[0] for name, parts in columns.items()
         }
+
+    def gradients(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Derivatives of the radiance, [N, W] each, under the names that files have for them.
+
+        ``d_radiance/NAME``: by a number; ``dlog_radiance/NAME``: by the logarithm of a common factor of all numbers of
+        a list. Raises InputError for an unknown name.
+        """
+        found = {}
+        for name, values in self.jacobian(names).items():
+            value = 1.0 if name in VIEWS else described(self.atmosphere, name)
+            if np.ndim(value):
+                values = values @ value if ".profile." in name else values * value
+            found[f"{'dlog' if np.ndim(value) else 'd'}_radiance/{name}"] = values.astype(np.float32)
+        return found
 
     # ---- how
 

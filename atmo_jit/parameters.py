@@ -7,7 +7,7 @@ those numbers, exact far beyond the single precision of the kernels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,19 +22,21 @@ _FIXED = ("wavelengths_nm", "cos_theta", "values", "moments")
 STEP = 1e-5  # relative
 
 
-def parameter_names(atmosphere: Atmosphere) -> tuple[str, ...]:
-    """The names of everything continuous that a sky depends on: of the atmosphere first, then of the views."""
-    return (*(name for name in atmosphere.names() if name.rpartition(".")[2] not in _FIXED), *VIEWS)
+def parameter_names(atmosphere: Atmosphere, views: Collection[str] = VIEWS) -> tuple[str, ...]:
+    """The names of everything continuous that a sky depends on: of the atmosphere first, then of the ``views`` that are
+    given."""
+    own = (name for name in atmosphere.names() if name.rpartition(".")[2] not in _FIXED)
+    return (*own, *(name for name in VIEWS if name in views))
 
 
-def check_names(atmosphere: Atmosphere, names: Sequence[str], *, where: str = "gradient") -> tuple[str, ...]:
+def check_names(atmosphere: Atmosphere, names: Sequence[str], views: Collection[str] = VIEWS) -> tuple[str, ...]:
     """The names, each once. Raises InputError for one that is unknown."""
-    allowed = parameter_names(atmosphere)
+    allowed = parameter_names(atmosphere, views)
     if isinstance(names, str):
         names = [names]
     for name in names:
         if name not in allowed:
-            raise InputError(f"{where}: {name!r} is no parameter; allowed are {', '.join(allowed)}")
+            raise InputError(f"gradient: {name!r} is no parameter; allowed are {', '.join(allowed)}")
     return tuple(dict.fromkeys(names))
 
 

@@ -10,9 +10,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -29,6 +29,7 @@ from .grid import Grid
 from .march import Rays, march, rays_to_boundary
 from .multiple_scattering import solve, solve_again
 from .optics import MAX_CHANNELS, Optics
+from .parameters import check_names
 from .pieces import Pieces, light_along
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
@@ -263,7 +264,8 @@ class SkyResult:
 
     ``radiance`` (W m^-2 sr^-1 nm^-1 for the atmosphere's solar irradiance; 1/sr where that is 1), ``transmittance``
     along the ray, ``sun_irradiance`` and ``sky_irradiance`` on a horizontal surface at the observer (W m^-2 nm^-1);
-    ``meta``: version, seconds, tolerance, orders, method and the plan (resolution) of the solve.
+    ``meta``: version, seconds, tolerance, orders, method and the plan (resolution) of the solve. ``gradient``: the
+    derivatives that were asked for, by name (derivatives.Linearization.gradients).
     """
 
     radiance: np.ndarray
@@ -271,6 +273,7 @@ class SkyResult:
     sun_irradiance: np.ndarray
     sky_irradiance: np.ndarray
     meta: dict[str, Any]
+    gradient: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def sky(
@@ -282,6 +285,7 @@ def sky(
     ground: bool = True,
     sun_disc: bool = False,
     method: str = "auto",
+    gradient: Sequence[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> SkyResult:
     """Radiance, transmittance and irradiances for a list of views.
@@ -291,15 +295,17 @@ def sky(
     one length N (see atmo_jit.views). ``orders``: scattering and reflection events counted (None: all, to
     ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the sun's.
     ``method``: "march" integrates every ray, "tables" interpolates them where a table serves, "auto" takes tables where
-    they pay and keep the tolerance. ``progress`` is called with the fraction done.
+    they pay and keep the tolerance. ``gradient``: names of parameters by which the radiance is differentiated
+    (parameters.parameter_names has them all). ``progress`` is called with the fraction done.
 
-    Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad
+    Raises InputError for views, orders, tolerance, method or names that are not allowed, AtmosphereError for a bad
     atmosphere, LLVMError without a usable LLVM.
     """
     if method not in METHODS:
         raise InputError(f"method: is {method!r}; must be one of {', '.join(METHODS)}")
     air = Atmosphere.load(atmosphere)
     checked = check_views(views)
+    names = check_names(air, gradient, checked)
     start = time.perf_counter()
     solved = Sky(air, orders, tolerance)
     solve_seconds = time.perf_counter() - start
@@ -315,6 +321,12 @@ def sky(
         arrays, done = evaluate(
             solved, checked, method=method, tolerance=tolerance, ground=ground, sun_disc=sun_disc, march=by_march
         )
+    derivatives = {}
+    if names:
+        from .derivatives import Linearization  # builds on this module
+
+        options = {"tolerance": tolerance, "orders": orders, "ground": ground, "sun_disc": sun_disc}
+        derivatives = Linearization(air, checked, **options).gradients(names)
     meta = {
         "atmo_jit": __version__,
         "seconds": time.perf_counter() - start,
@@ -325,7 +337,7 @@ def sky(
         "wavelengths_nm": air.wavelengths_nm.tolist(),
         "plan": asdict(solved.resolution),
     }
-    return SkyResult(*arrays, meta)
+    return SkyResult(*arrays, meta, derivatives)
 
 
 def _march(
