@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -19,14 +18,17 @@ import numpy as np
 
 from .atmosphere import Atmosphere
 from .backend import doubles, traversing, types
-from .optics import on_device
+from .optics import Optics, on_device
 from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, tangent
 from .pieces import Pieces
+from .recording import Recordings, copied
+from .resolution import Resolution
 from .sky import Sky
 from .views import check_views
 
 OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
-SHAPE = ("profiles", "sun_radius")  # of Optics.values: with these, nothing that is kept with a grid serves
+GEOMETRY = ("radius", "thickness")  # of Optics.values, and
+SHAPE = ("profiles", "sun_radius")  # with these, nothing that is kept with a grid serves
 RADIUS_STEP = 5e-3  # of the planet's radius, and
 THICKNESS_STEP = 2e-2  # of its atmosphere's thickness: the light is nearly linear over them
 
@@ -46,20 +48,22 @@ class Linearization:
         orders: int | None = None,
         ground: bool = True,
         sun_disc: bool = False,
+        resolution: Resolution | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         self.views = check_views(views)
         self._options = {"ground": ground, "sun_disc": sun_disc}
         self._solving = {"orders": orders, "tolerance": tolerance}
-        self._thorough = {"sure": True, "scattering_too": [c.name for c in self.atmosphere.constituents]}
-        self.sky = Sky(self.atmosphere, **self._solving, **self._thorough)
+        too = [c.name for c in self.atmosphere.constituents]
+        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, sure=True, scattering_too=too)
         r = self.sky.resolution
         self._degrees, self._phase_degree = r.degrees, r.phase_degree
 
     @cached_property
     def value(self) -> dict[str, np.ndarray]:
         """See the class."""
-        return self._arrays(self._evaluate(self._on_device(), self._view_arrays()))
+        made = [on_device(part) for part in self._numbers]
+        return self._arrays(self._evaluation(made, *self._arguments))
 
     def jacobian(self, names: Sequence[str], output: str = "radiance") -> dict[str, np.ndarray]:
         """Derivatives of one output by name: [N, W]; [N, W, n] for the n nodes of a profile.
@@ -111,38 +115,42 @@ class Linearization:
         by_curvature = self._difference(air.bottom_radius_m * RADIUS_STEP, lambda step: dict.fromkeys(RADII, step))
         return {output: by_curvature[output] - by_thickness[output] for output in OUTPUTS}
 
+    def _elsewhere(self, atmosphere: Atmosphere) -> Linearization:
+        """The same for another atmosphere."""
+        return Linearization(
+            atmosphere, self.views, resolution=self.sky.resolution, **self._solving, **self._options
+        )
+
     def _difference(self, step: float, changes: Callable[[float], dict[str, float]]) -> dict[str, np.ndarray]:
         ends = []
         for sign in (1.0, -1.0):
             moved = {name: getattr(self.atmosphere, name) + s for name, s in changes(sign * step).items()}
-            other = copy(self)
-            other.sky = Sky(
-                self.atmosphere.replace(moved), resolution=self.sky.resolution, **self._solving, **self._thorough
-            )
-            ends.append(other._arrays(other._evaluate(other._on_device(), other._view_arrays())))
+            ends.append(self._elsewhere(self.atmosphere.replace(moved)).value)
         return {output: (ends[0][output] - ends[1][output]) / (2.0 * step) for output in OUTPUTS}
 
+    @cached_property
     def _numbers(self) -> list[dict[str, Any]]:
-        bands = self.sky.bands
-        return [b.optics.numbers(b.optics.atmosphere, self._degrees, self._phase_degree) for b in bands]
+        return [optics.numbers(optics.atmosphere, self._degrees, self._phase_degree) for optics in self._optics]
 
-    def _on_device(self) -> list[dict[str, Any]]:
-        return [on_device(numbers) for numbers in self._numbers()]
+    @property
+    def _optics(self) -> list[Optics]:
+        return [band.optics for band in self.sky.solutions]
 
-    def _view_arrays(self) -> dict[str, Any]:
-        return {name: doubles(values) for name, values in self.views.items()}
+    @cached_property
+    def _arguments(self) -> tuple[Any, ...]:
+        """What _Evaluation takes beside values: views, pieces of their rays, shares of the orders."""
+        views = {name: doubles(values) for name, values in self.views.items()}
+        rays, _, _ = self.sky.enter(*_where(views))
+        pieces = [Pieces.of(optics, rays) for optics in self._optics]
+        return views, pieces, [band.field.shares for band in self.sky.solutions]
 
-    def _evaluate(self, values: list[dict[str, Any]], views: dict[str, Any]) -> list[Any]:
-        """All outputs, one Float [N] each, in the order of OUTPUTS and wavelengths."""
-        sky = self.sky.again(values)
-        degree = np.pi / 180.0
-        where = [views["altitude_m"], *(views[name] * degree for name in VIEWS[1:4]), views.get("distance_m")]
-        rays, _, _ = sky.enter(*where)
-        pieces = [Pieces.of(band.optics, rays) for band in sky.bands]
-        light = sky.rays(*where, **self._options, pieces=pieces)
-        sun, scattered = sky.irradiance(where[0], where[1])
-        zero = dr.zeros(types().Float, len(self.views["altitude_m"]))
-        return [v + zero for v in (*light.radiance, *light.transmittance, *sun, *scattered)]
+    @cached_property
+    def _evaluation(self) -> _Evaluation:
+        views, pieces, shares = self._arguments
+        sizes = [dr.width(views["altitude_m"]), *(part and part.count for part in pieces), *map(len, shares)]
+        key = [tuple(views), *sizes, *self._options.values(), *self._solving.values()]
+        key += [(optics.make_up, optics.phase_kinds) for optics in self._optics]
+        return self.sky.grid.kept(("evaluation", *key), lambda: _Evaluation(self.sky, self._options))
 
     def _arrays(self, outputs: list[Any]) -> dict[str, np.ndarray]:
         stacked = np.stack([v.numpy() for v in outputs], axis=-1)
@@ -150,46 +158,83 @@ class Linearization:
 
     def _forward(self, seeds: list[tuple[str, Any]]) -> list[dict[str, np.ndarray]]:
         """The derivative of all outputs along every seed, a name and a direction."""
-        bands = self.sky.bands
-        tangents = [
-            [tangent(band.optics, *seed, self._degrees, self._phase_degree) for band in bands]
-            if seed[0] not in VIEWS
-            else None
-            for seed in seeds
-        ]
-        numbers = self._numbers()
-        return [
-            self._along(numbers, name if of_seed is None else None, of_seed)
-            for (name, _), of_seed in zip(seeds, tangents, strict=True)
-        ]
+        found = []
+        for name, direction in seeds:
+            views, values = None, None
+            if name in VIEWS:
+                views = {n: doubles(np.full(len(v), float(n == name))) for n, v in self.views.items()}
+            else:
+                tangents = [tangent(o, name, direction, self._degrees, self._phase_degree) for o in self._optics]
+                steps = [like(part, t) for part, t in zip(self._numbers, tangents, strict=True)]
+                # All values of a group carry derivatives, also those that are 0: parameters then share kernels.
+                shaped = any(np.any(leaf) for part in steps for leaf in flat([part[n] for n in SHAPE]))
+                names = SHAPE if shaped else [n for n in self._numbers[0] if n not in (*SHAPE, *GEOMETRY)]
+                values = [on_device({n: part[n] for n in names}) for part in steps]
+            made = [on_device(part) for part in self._numbers]
+            outputs, changes = self._evaluation.forward(made, *self._arguments, values, views)
+            self.__dict__.setdefault("value", self._arrays(outputs))
+            found.append(self._arrays(changes))
+        return found
 
-    def _along(
-        self, numbers: list[dict[str, Any]], view: str | None, tangents: list[list[np.ndarray]] | None
-    ) -> dict[str, np.ndarray]:
-        """Derivatives of all outputs by an array of views, or along tangents of the numbers of every band."""
-        values, views = [on_device(part) for part in numbers], self._view_arrays()
-        roots = []
-        if view is not None:
-            roots = [(array, doubles(np.full(array.shape, float(name == view)))) for name, array in views.items()]
-        for part, made, of_band in zip(numbers, values, tangents or [], strict=False):
-            along = on_device(like(part, _shaped(of_band)))
-            # All of them carry derivatives, also those that are 0: every parameter then shares the same kernels.
-            shaped = any(np.any(t) for name in SHAPE for t in flat(like(part, of_band)[name]))
-            names = SHAPE if shaped else [name for name in part if name not in (*SHAPE, "radius", "thickness")]
-            roots += [pair for name in names for pair in zip(flat(made[name]), flat(along[name]), strict=True)]
-        for root, _ in roots:
-            dr.enable_grad(root)
+
+class _Evaluation:
+    """The outputs of a sky as a function of values, views, pieces of their rays, and shares of the orders.
+
+    It and its derivatives are recorded (dr.freeze) where they are asked for more than once: tracing costs several
+    times what running does.
+    """
+
+    def __init__(self, sky: Sky, options: dict[str, Any]) -> None:
+        self._sky, self._options = sky, options
+        self._recordings = Recordings(sky.grid)
+        self._recorded = all(optics.phase_kinds is not None for optics in (band.optics for band in sky.solutions))
+
+    def __call__(self, *arguments: Any) -> list[Any]:
+        """All outputs, one Float [N] each, in the order of OUTPUTS and wavelengths."""
+        return self._run("value", self._outputs, *arguments)
+
+    def forward(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
+        """Outputs, and how they change along ``values`` and ``views``, the last two arguments (None: not at all)."""
+        *_, values, views = arguments
+        return self._run(("forward", values and tuple(values[0]), views is None), self._forward, *arguments)
+
+    def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():
-            outputs = self._evaluate(values, views)
-            for root, step in roots:
-                dr.set_grad(root, step)
-            dr.enqueue(dr.ADMode.Forward, *(root for root, _ in roots))
-            dr.traverse(dr.ADMode.Forward)
-            return self._arrays(dr.grad(outputs))
+            return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
+
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], shares: list[Any]) -> list[Any]:
+        sky = self._sky.again(values, shares)
+        where = _where(views)
+        light = sky.rays(*where, **self._options, pieces=pieces)
+        sun, scattered = sky.irradiance(where[0], where[1])
+        zero = dr.zeros(types().Float, dr.width(where[0]))
+        outputs = [v + zero for v in (*light.radiance, *light.transmittance, *sun, *scattered)]
+        dr.eval(outputs)
+        return outputs
+
+    def _forward(
+        self, values: Any, views: Any, pieces: Any, shares: Any, along_values: Any, along_views: Any
+    ) -> tuple[list[Any], list[Any]]:
+        values, views = copied(values), copied(views)
+        pairs = [pair for name in along_views or () for pair in [(views[name], along_views[name])]]
+        for made, steps in zip(values, along_values or (), strict=False):
+            pairs += [pair for name in steps for pair in zip(flat(made[name]), flat(steps[name]), strict=True)]
+        for leaf, _ in pairs:
+            dr.enable_grad(leaf)
+        outputs = self._outputs(values, views, pieces, shares)
+        for leaf, step in pairs:
+            dr.set_grad(leaf, step)
+        dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in pairs))
+        dr.traverse(dr.ADMode.Forward)
+        changes = dr.grad(outputs)
+        dr.eval(changes)
+        return dr.detach(outputs), changes
 
 
-def _shaped(leaves: list[np.ndarray]) -> list[Any]:
-    return [leaf if leaf.ndim else float(leaf) for leaf in leaves]
+def _where(views: dict[str, Any]) -> list[Any]:
+    """Arguments of Sky.rays."""
+    degree = np.pi / 180.0
+    return [views["altitude_m"], *(views[name] * degree for name in VIEWS[1:4]), views.get("distance_m")]
 
 
 def linearize(atmosphere: Any, views: Mapping[str, Any], **options: Any) -> Linearization:

@@ -122,21 +122,22 @@ class Rule:
     """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW
     coarser nodes.
 
-    The node count is a parameter: another one needs no other kernel.
+    The node count is a parameter: another one needs no other kernel. ``rows``: those of a rule of as many nodes.
     """
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, rows: Any = None) -> None:
         t = types()
         x, w = gauss_legendre(nodes)
         few_x, few_w = gauss_legendre(FEW)
         self.few_x, self.few_w = few_x.tolist(), few_w.tolist()
-        rows = np.column_stack([x, w, running_integral(FEW, tuple(x)), np.zeros((nodes, 8 - 2 - FEW))])
-        self._rows = floats(rows)
+        if rows is None:
+            rows = floats(np.column_stack([x, w, running_integral(FEW, tuple(x)), np.zeros((nodes, 8 - 2 - FEW))]))
+        self.rows = rows
         self.count = dr.opaque(t.UInt, nodes, 1)
 
     def at(self, g: Any) -> list[Any]:
         """Node x, weight w, and the FEW coefficients of the column up to x."""
-        return packet(self._rows, g, 8)[: 2 + FEW]
+        return packet(self.rows, g, 8)[: 2 + FEW]
 
     def sum(self, coefficients: list[Any], density: list[list[Any]], constituent: int) -> Any:
         """Sum over the few nodes of coefficient times density."""

@@ -7,7 +7,6 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -23,6 +22,7 @@ from .grid import Grid
 from .optics import Optics
 from .paths import directions_at
 from .projection import Moments, Projection
+from .recording import Recordings
 from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
@@ -126,8 +126,7 @@ class _Steps:
     def __init__(self, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> None:
         self._optics, self._columns, self._grid, self._resolution = optics, columns, grid, resolution
         self._stages = [directions_at(grid, s.up, s.down) for s in resolution.stages]
-        self._recorded: dict[Any, Callable[..., Any]] = {}
-        self._used: set[Any] = set()
+        self._recordings = Recordings(grid)
 
     @classmethod
     def of(cls, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> _Steps:
@@ -171,21 +170,7 @@ class _Steps:
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
             return function(*arguments)
-        if key not in self._used:
-            self._used.add(key)
-            return function(*arguments)
-        if key not in self._recorded:
-            arrays = self._grid.arrays()
-            self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
-        # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
-        # collector has to wait.
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return self._recorded[key](*arguments)
-        finally:
-            if collects:
-                gc.enable()
+        return self._recordings.run(key, function, *arguments)
 
     def _stage(self, n: int) -> int:
         return min(n - 2, len(self._stages) - 1)

@@ -17,6 +17,7 @@ import numpy as np
 
 from .atmosphere import Atmosphere
 from .backend import floats, parameter, table
+from .phase import CornetteShanks, HenyeyGreenstein, RayleighPhase
 from .profile import Exponential, Tabulated, Tent
 from .resolution import moments_of
 
@@ -77,6 +78,16 @@ class Optics:
     def make_up(self) -> tuple[Any, ...]:
         """What kernels depend on beside values: how many channels and which constituents scatter."""
         return self.channel_count, tuple(self.scatterers), len(self.constituents)
+
+    @property
+    def phase_kinds(self) -> tuple[Any, ...] | None:
+        """What kernels compile of the phase functions; None where they compile numbers, or tables of them."""
+        kinds = []
+        for c in self.constituents:
+            if c.phase is not None and not isinstance(c.phase, (HenyeyGreenstein, CornetteShanks, RayleighPhase)):
+                return None
+            kinds.append((type(c.phase), np.ndim(getattr(c.phase, "g", 0.0))))
+        return tuple(kinds)
 
     def numbers(
         self, atmosphere: Atmosphere, degrees: tuple[int, ...] = (), phase_degree: int | None = None

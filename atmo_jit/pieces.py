@@ -33,13 +33,15 @@ from .optics import Optics
 @dataclass
 class Pieces:
     """Pieces of rays, ray after ray: ``first`` [N + 1]: where those of each ray start. Per piece: ``ray``, ``start``
-    and ``length`` (m); ``closes``: it reaches the end of the ray."""
+    and ``length`` (m); ``closes``: it reaches the end of the ray. After the last come some of no length that no ray
+    has. ``rule``: rows of march.Rule by which all are integrated."""
 
     first: Any
     ray: Any
     start: Any
     length: Any
     closes: Any
+    rule: Any
 
     @property
     def count(self) -> int:
@@ -81,6 +83,7 @@ class Pieces:
             total = int(ends[width - 1])
             if total == 0:
                 return None
+            total = _room(total)
             ray, start, length = dr.zeros(t.UInt, total), dr.zeros(t.Float, total), dr.zeros(t.Float, total)
             closes, before = dr.zeros(t.UInt, total), ends - counts
             lane = dr.arange(t.UInt, width)
@@ -96,7 +99,9 @@ class Pieces:
             first = dr.zeros(t.UInt, width + 1)
             dr.scatter(first, ends, lane + 1)
             dr.eval(first)
-        return cls(first, ray, start, length, closes > 0)
+            closes = closes > 0
+            dr.eval(closes)
+        return cls(first, ray, start, length, closes, Rule(NODES).rows)
 
 
 def light_along(
@@ -105,7 +110,6 @@ def light_along(
     rays: Rays,
     pieces: Pieces | None,
     *,
-    nodes: int = NODES,
     source: Source | None = None,
 ) -> Light:
     """What march.march returns, differentiable with respect to everything that enters."""
@@ -114,7 +118,7 @@ def light_along(
     if pieces is None:
         zero = [dr.zeros(t.Float, width) for _ in range(channels)]
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(channels)])
-    lane, rule = dr.arange(t.UInt, pieces.count), Rule(nodes)
+    lane, rule = dr.arange(t.UInt, pieces.count), Rule(NODES, pieces.rule)
     full = dr.zeros(t.Float, width)
     members = [evaluated(v + full) for v in (rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop)]
     h, mu, mu_s, nu, stop = (dr.gather(t.Float, v, pieces.ray) for v in members)
@@ -171,6 +175,12 @@ def light_along(
         sums[channels:],
         [dr.exp(-depth) for depth in depths],
     )
+
+
+def _room(count: int) -> int:
+    """Pieces for which there is room: sizes that seldom change between atmospheres, so that recordings serve."""
+    step = 1 << max(count.bit_length() - 4, 4)
+    return -(-count // step) * step
 
 
 def _sums(table: Any, start: Any, stop: Any, count: int) -> list[Any]:

@@ -97,14 +97,14 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.atmosphere, self.resolution, self._suns)
 
-    def again(self, values: list[dict[str, Any]]) -> Sky:
-        """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives: as many orders, on
-        the same nodes."""
+    def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
+        """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
+        of orders (Field) of a sky that was solved, on the same nodes."""
         other, other._bands = copy(self), []
-        for band, new in zip(self._bands, values, strict=True):
+        for band, new, of_orders in zip(self._bands, values, shares, strict=True):
             optics = band.optics.with_values(new)
             columns = sun_columns(optics, self.grid)
-            field = solve_again(optics, columns, self.grid, self.resolution, band.field.shares, self.orders)
+            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders)
             other._bands.append(_Band(field.optics, columns, field))
         return other
 
@@ -113,6 +113,11 @@ class Sky:
         """The solution at up to four wavelengths each, its look-up tables made: what tables are baked from."""
         for band in self._bands:
             band.field.prepare()
+        return self._bands
+
+    @property
+    def solutions(self) -> list[_Band]:
+        """The same, as they are."""
         return self._bands
 
     def rays(
