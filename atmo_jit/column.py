@@ -15,12 +15,13 @@ the logarithm of their mean is interpolated linearly in h.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, parameter, types
+from .backend import evaluated, floats, packet, parameter, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
 from .optics import Optics
@@ -54,8 +55,15 @@ class SunColumns:
         self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
         self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
+        self._breaks = floats(breaks)
         self._table = self._build() if self._count else None
-        dr.eval(self._table)
+
+    def of(self, optics: Optics) -> SunColumns:
+        """The table for other optics with profiles of the same kind, cut at the same altitudes."""
+        other = copy(self)
+        other.optics = optics
+        other._table = other._build() if self._count else None
+        return other
 
     def _build(self) -> Any:
         t = types()
@@ -67,14 +75,14 @@ class SunColumns:
         # Each end belongs to this shell's side of the break.
         h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
-        totals = column_up(self.optics, h, mu)
+        totals = column_up(self.optics, h, mu, self._breaks)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         table = dr.zeros(t.Float, dr.width(lane) * self._count)
         at_top = self.optics.densities(h)  # where the path has no length
         for k, total in enumerate(totals):
             mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
             dr.scatter(table, dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean, lane * self._count + k)
-        return table
+        return evaluated(table)
 
     def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
         """Column density (m) of every constituent from altitude ``h`` to the top in direction ``mu`` of either sign.
@@ -127,16 +135,16 @@ class SunColumns:
 
 def sun_columns(optics: Optics, grid: Grid) -> SunColumns:
     """The table for an atmosphere, kept with the grid unless the profiles carry derivatives."""
-    if optics.profiles_differentiable:
-        return SunColumns(optics, grid.resolution.columns)
-    return grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    with dr.suspend_grad():
+        columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    return columns.of(optics) if optics.profiles_differentiable else columns
 
 
-def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:
+def column_up(optics: Optics, h: Any, mu: Any, breaks: Any = None) -> list[Any]:
     """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the
-    profile's breaks."""
+    profile's ``breaks`` (default: optics.breaks_m)."""
     t = types()
-    breaks = floats(optics.breaks_m)
+    breaks = floats(optics.breaks_m) if breaks is None else breaks
     x, w = gauss_legendre(NODES_PER_LAYER)
 
     def layer(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:

@@ -17,9 +17,10 @@ import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere
-from .backend import doubles, traversing, types
+from .backend import doubles, floats, traversing, types
+from .errors import InputError
 from .optics import Optics, on_device
-from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, tangent
+from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, per_wavelength, tangent
 from .pieces import Pieces
 from .recording import Recordings, copied
 from .resolution import Resolution
@@ -29,6 +30,7 @@ from .views import check_views
 OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
 GEOMETRY = ("radius", "thickness")  # of Optics.values, and
 SHAPE = ("profiles", "sun_radius")  # with these, nothing that is kept with a grid serves
+PROFILE = ("scale_height_m", "center_m", "half_width_m")
 RADIUS_STEP = 5e-3  # of the planet's radius, and
 THICKNESS_STEP = 2e-2  # of its atmosphere's thickness: the light is nearly linear over them
 
@@ -86,6 +88,61 @@ class Linearization:
         return {
             name: np.stack(parts, axis=-1) if ".profile." in name else parts[0] for name, parts in columns.items()
         }
+
+    def vjp(self, cotangents: Mapping[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Derivatives of sum(cotangents[output] * output) over the named outputs, by name, in reverse: one pass for
+        all, each of the shape of its parameter.
+
+        ``cotangents``: arrays [N, W] by output. Raises InputError for an unknown name.
+        """
+        names = check_names(self.atmosphere, names, self.views)
+        unknown = [name for name in cotangents if name not in OUTPUTS]
+        if unknown:
+            raise InputError(f"cotangents: {unknown[0]!r} is no output; allowed are {', '.join(OUTPUTS)}")
+        shape = len(self.views["altitude_m"]), len(self.atmosphere.wavelengths_nm)
+        weights = [np.broadcast_to(np.asarray(cotangents.get(name, 0.0), np.float32), shape) for name in OUTPUTS]
+        of_values = sorted({group for name in names for group in self._groups(name)})
+        of_views = sorted(set(names) & set(VIEWS))
+        adjoints: tuple[Any, Any] = [], {}
+        if of_values or of_views:
+            made = [on_device(part) for part in self._numbers]
+            columns = [floats(column) for column in np.concatenate(weights, axis=-1).T]
+            adjoints = self._evaluation.reverse(made, *self._arguments, columns, of_values, of_views)
+        found = {name: adjoints[1][name].numpy() for name in of_views}
+        for name in names:
+            if name in RADII:
+                change = self._by_radius(name)
+                found[name] = np.sum([np.vdot(w, change[o]) for w, o in zip(weights, OUTPUTS, strict=True)])
+            elif name not in VIEWS:
+                found[name] = self._pulled_back(name, adjoints[0])
+        return found
+
+    def _pulled_back(self, name: str, adjoints: list[dict[str, Any]]) -> np.ndarray:
+        """Derivative by a parameter from those by the values of every band."""
+        value = described(self.atmosphere, name)
+        by_entry = np.zeros(np.size(value))
+        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints]
+        for optics, part in zip(self._optics, host, strict=True):
+            for entry in range(np.size(value)):
+                if per_wavelength(self.atmosphere, name) and entry not in optics.indices:
+                    continue
+                direction = np.eye(np.size(value))[entry].reshape(np.shape(value))
+                steps = like(self._numbers[0], tangent(optics, name, direction, self._degrees, self._phase_degree))
+                for group, adjoint in part.items():
+                    along = [leaf.numpy() for leaf in flat(on_device(steps[group]))]
+                    by_entry[entry] += sum(np.vdot(a, b) for a, b in zip(adjoint, along, strict=True))
+        return by_entry.reshape(np.shape(value))
+
+    def _groups(self, name: str) -> tuple[str, ...]:
+        """The values, by name, that carry derivatives when those by a parameter are asked for.
+
+        All values of a kind together, also those that the parameter does not move: parameters then share kernels.
+        """
+        if name in VIEWS or name in RADII:
+            return ()
+        if name == "sun_angular_radius_deg" or name.rpartition(".")[2] in PROFILE or ".profile." in name:
+            return SHAPE
+        return tuple(n for n in self._numbers[0] if n not in (*SHAPE, *GEOMETRY))
 
     def gradients(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Derivatives of the radiance, [N, W] each, under the names that files have for them.
@@ -166,10 +223,7 @@ class Linearization:
             else:
                 tangents = [tangent(o, name, direction, self._degrees, self._phase_degree) for o in self._optics]
                 steps = [like(part, t) for part, t in zip(self._numbers, tangents, strict=True)]
-                # All values of a group carry derivatives, also those that are 0: parameters then share kernels.
-                shaped = any(np.any(leaf) for part in steps for leaf in flat([part[n] for n in SHAPE]))
-                names = SHAPE if shaped else [n for n in self._numbers[0] if n not in (*SHAPE, *GEOMETRY)]
-                values = [on_device({n: part[n] for n in names}) for part in steps]
+                values = [on_device({n: part[n] for n in self._groups(name)}) for part in steps]
             made = [on_device(part) for part in self._numbers]
             outputs, changes = self._evaluation.forward(made, *self._arguments, values, views)
             self.__dict__.setdefault("value", self._arrays(outputs))
@@ -197,6 +251,27 @@ class _Evaluation:
         """Outputs, and how they change along ``values`` and ``views``, the last two arguments (None: not at all)."""
         *_, values, views = arguments
         return self._run(("forward", values and tuple(values[0]), views is None), self._forward, *arguments)
+
+    def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+        """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
+        them the weights, Floats [N] in the order of the outputs."""
+        *arrays, of_values, of_views = arguments
+
+        def function(values: Any, views: Any, pieces: Any, shares: Any, weights: Any) -> tuple[Any, Any]:
+            values, views = copied(values), copied(views)
+            wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
+            dr.enable_grad(wanted)
+            outputs = self._outputs(values, views, pieces, shares)
+            pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
+            for output, weight in pairs:
+                dr.set_grad(output, weight)
+            dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
+            dr.traverse(dr.ADMode.Backward)
+            adjoints = dr.grad(wanted)
+            dr.eval(adjoints)
+            return adjoints
+
+        return self._run(("reverse", *of_values, *of_views), function, *arrays)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():

@@ -41,7 +41,7 @@ class Sunbeam:
 
         def beams() -> Any:
             lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
-            h = dr.gather(t.Float, floats(paths.levels), lane // self.COSINES)
+            h = dr.gather(t.Float, paths.kept("levels", lambda: floats(paths.levels)), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
             seen = visible_sun(optics, h, optics.radius + h, mu_s)
             return table_of([seen, *columns.toward(h, mu_s)], lane)
