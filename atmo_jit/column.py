@@ -93,7 +93,7 @@ class SunColumns:
         if not self._count:
             return []
         radius = self.optics.radius
-        mu = dr.maximum(mu, -dr.sqrt(h * (2.0 * radius + h)) / (radius + h))
+        mu = dr.maximum(mu, -dr.safe_sqrt(h * (2.0 * radius + h)) / (radius + h))
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
@@ -107,13 +107,13 @@ class SunColumns:
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
         t = types()
         cosines = self._cosines
-        position = dr.sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
+        position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
         shell = t.UInt(dr.gather(t.Float, self._shell_of_cell, dr.minimum(t.UInt(position), _CELLS), active))
         _, high, _, _ = packet(self._bounds, shell, 4, active)
         shell = dr.select((h >= high) & (shell + 1 < self._shells), shell + 1, shell)
         low, high, per_width, _ = packet(self._bounds, shell, 4, active)
         depth = dr.clip((high - h) * per_width, 0.0, 1.0)
-        y = dr.sqrt(depth) * self._rows
+        y = dr.safe_sqrt(depth) * self._rows
         row = dr.minimum(t.UInt(y), self._rows - 1)
         start = t.Float(row)
         by_root = y - start

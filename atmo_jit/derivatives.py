@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import drjit as dr
@@ -61,6 +61,11 @@ class Linearization:
         r = self.sky.resolution
         self._degrees, self._phase_degree = r.degrees, r.phase_degree
 
+    @property
+    def rays(self) -> int:
+        """N, the number of views."""
+        return len(self.views["altitude_m"])
+
     @cached_property
     def value(self) -> dict[str, np.ndarray]:
         """See the class."""
@@ -89,6 +94,18 @@ class Linearization:
             name: np.stack(parts, axis=-1) if ".profile." in name else parts[0] for name, parts in columns.items()
         }
 
+    def jvp(self, changes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Changes of all outputs, [N, W] by name, along changes of parameters (each of the shape of its parameter, or
+        one number for all of it). Raises InputError for an unknown name."""
+        names = check_names(self.atmosphere, tuple(changes), self.views)
+        total = {output: np.zeros(values.shape) for output, values in self.value.items()}
+        for name in set(names) & set(RADII):
+            total = {o: total[o] + float(changes[name]) * v for o, v in self._by_radius(name).items()}
+        seeds = [(name, changes[name]) for name in names if name not in RADII and np.any(changes[name])]
+        if seeds:
+            total = {o: total[o] + v for o, v in self._along(seeds).items()}
+        return total
+
     def vjp(self, cotangents: Mapping[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
         """Derivatives of sum(cotangents[output] * output) over the named outputs, by name, in reverse: one pass for
         all, each of the shape of its parameter.
@@ -99,7 +116,7 @@ class Linearization:
         unknown = [name for name in cotangents if name not in OUTPUTS]
         if unknown:
             raise InputError(f"cotangents: {unknown[0]!r} is no output; allowed are {', '.join(OUTPUTS)}")
-        shape = len(self.views["altitude_m"]), len(self.atmosphere.wavelengths_nm)
+        shape = self.rays, len(self.atmosphere.wavelengths_nm)
         weights = [np.broadcast_to(np.asarray(cotangents.get(name, 0.0), np.float32), shape) for name in OUTPUTS]
         of_values = sorted({group for name in names for group in self._groups(name)})
         of_views = sorted(set(names) & set(VIEWS))
@@ -215,20 +232,24 @@ class Linearization:
 
     def _forward(self, seeds: list[tuple[str, Any]]) -> list[dict[str, np.ndarray]]:
         """The derivative of all outputs along every seed, a name and a direction."""
-        found = []
-        for name, direction in seeds:
-            views, values = None, None
-            if name in VIEWS:
-                views = {n: doubles(np.full(len(v), float(n == name))) for n, v in self.views.items()}
-            else:
-                tangents = [tangent(o, name, direction, self._degrees, self._phase_degree) for o in self._optics]
-                steps = [like(part, t) for part, t in zip(self._numbers, tangents, strict=True)]
-                values = [on_device({n: part[n] for n in self._groups(name)}) for part in steps]
-            made = [on_device(part) for part in self._numbers]
-            outputs, changes = self._evaluation.forward(made, *self._arguments, values, views)
-            self.__dict__.setdefault("value", self._arrays(outputs))
-            found.append(self._arrays(changes))
-        return found
+        return [self._along([seed]) for seed in seeds]
+
+    def _along(self, seeds: list[tuple[str, Any]]) -> dict[str, np.ndarray]:
+        """The derivative of all outputs along the sum of the seeds, names and directions."""
+        views, groups = None, sorted({group for name, _ in seeds for group in self._groups(name)})
+        if any(name in VIEWS for name, _ in seeds):
+            given = dict(seeds)
+            views = {n: doubles(np.broadcast_to(given.get(n, 0.0), v.shape)) for n, v in self.views.items()}
+        values = [] if groups else None
+        for optics, numbers in zip(self._optics, self._numbers, strict=True) if groups else ():
+            own = [(name, direction) for name, direction in seeds if name not in VIEWS]
+            parts = [tangent(optics, *seed, self._degrees, self._phase_degree) for seed in own]
+            steps = like(numbers, [sum(leaves) for leaves in zip(*parts, strict=True)])
+            values.append(on_device({group: steps[group] for group in groups}))
+        made = [on_device(part) for part in self._numbers]
+        outputs, changes = self._evaluation.forward(made, *self._arguments, values, views)
+        self.__dict__.setdefault("value", self._arrays(outputs))
+        return self._arrays(changes)
 
 
 class _Evaluation:
@@ -310,6 +331,75 @@ def _where(views: dict[str, Any]) -> list[Any]:
     """Arguments of Sky.rays."""
     degree = np.pi / 180.0
     return [views["altitude_m"], *(views[name] * degree for name in VIEWS[1:4]), views.get("distance_m")]
+
+
+def differentiable(
+    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
+) -> dict[str, list[Any]]:
+    """What sky returns as Dr.Jit arrays that derivatives pass through: by output, W Floats [N].
+
+    ``parameters``: by name, Dr.Jit arrays (of one number, or as many as the parameter has) that take the place of the
+    atmosphere's values, and of the ``views``. Derivatives go from the outputs back to them (dr.backward) and the other
+    way (dr.forward); on the way the solver is asked for Linearization.vjp and jvp. ``options``: see Linearization.
+
+    Raises what Linearization raises, and InputError for a name that is no parameter.
+    """
+    air = Atmosphere.load(atmosphere)
+    outputs = dr.custom(_operation(), dict(parameters), lambda values: moved_to(air, views, values, **options))
+    count = len(outputs) // len(OUTPUTS)
+    return {name: outputs[i * count : (i + 1) * count] for i, name in enumerate(OUTPUTS)}
+
+
+def moved_to(
+    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
+) -> Linearization:
+    """The linearization where ``parameters``, arrays by name, take the place of the atmosphere's and the views'."""
+    air, views = Atmosphere.load(atmosphere), dict(views)
+    changes = {}
+    for name in check_names(air, tuple(parameters)):
+        value = np.array(parameters[name], dtype=np.float64).ravel()
+        if name in VIEWS:
+            views[name] = value if len(value) > 1 else float(value[0])
+        elif np.ndim(described(air, name)):
+            changes[name] = value.tolist() if len(value) > 1 else np.full(np.shape(described(air, name)), value[0])
+        else:
+            changes[name] = value.tolist() if len(value) > 1 else float(value[0])
+    return Linearization(air.replace(changes) if changes else air, views, **options)
+
+
+def shaped(gradient: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A derivative by a parameter in the shape in which the parameter was given: one number may stand for all."""
+    return np.sum(gradient).reshape(shape) if np.prod(shape) == 1 else gradient.reshape(shape)
+
+
+@lru_cache(maxsize=1)
+def _operation() -> type:
+    class SkyOperation(dr.CustomOp):
+        def eval(self, parameters: Any, linearized: Any) -> list[Any]:
+            self.kinds = {name: type(value) for name, value in parameters.items()}
+            self.sizes = {name: len(value) for name, value in parameters.items()}
+            with dr.suspend_grad():
+                self.at = linearized(parameters)
+                return [floats(column) for name in OUTPUTS for column in self.at.value[name].T]
+
+        def forward(self) -> None:
+            changes = {name: np.array(v, np.float64) for name, v in self.grad_in("parameters").items()}
+            moved = self.at.jvp({name: v if len(v) > 1 else v[0] for name, v in changes.items()})
+            self.set_grad_out([floats(column) for name in OUTPUTS for column in moved[name].T])
+
+        def backward(self) -> None:
+            columns = np.stack([np.broadcast_to(v.numpy(), self.at.rays) for v in self.grad_out()], axis=-1)
+            weights = dict(zip(OUTPUTS, np.split(columns, len(OUTPUTS), axis=-1), strict=True))
+            found = self.at.vjp(weights, tuple(self.kinds))
+            self.set_grad_in(
+                "parameters",
+                {n: kind(shaped(found[n], (self.sizes[n],)).tolist()) for n, kind in self.kinds.items()},
+            )
+
+        def name(self) -> str:
+            return "sky"
+
+    return SkyOperation
 
 
 def linearize(atmosphere: Any, views: Mapping[str, Any], **options: Any) -> Linearization:

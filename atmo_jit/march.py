@@ -76,7 +76,7 @@ def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
     Bruneton 2017, GetTransmittanceToSun; a point sun (radius 0) is cut sharply.
     """
     horizon_sine = optics.radius / r
-    horizon_mu = -dr.sqrt(h * (2.0 * optics.radius + h)) / r
+    horizon_mu = -dr.safe_sqrt(h * (2.0 * optics.radius + h)) / r
     half_width = dr.maximum(horizon_sine * optics.sun_radius, 1e-7)
     x = dr.clip(0.5 + 0.5 * (mu_s - horizon_mu) / half_width, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
@@ -289,7 +289,8 @@ def unfinished(optics: Optics, rays: Rays, d: Any, amounts: list[Any]) -> Any:
 def relative_azimuth(mu: Any, mu_s: Any, nu: Any) -> Any:
     """cos of the azimuth between view and sun at a point: (nu - mu mu_s) / (sin sin_s); 1 where either is vertical."""
     sines = safe_sine(mu) * safe_sine(mu_s)
-    return dr.select(sines > 0.0, dr.clip((nu - mu * mu_s) / sines, -1.0, 1.0), 1.0)
+    apart = sines > 0.0
+    return dr.select(apart, dr.clip((nu - mu * mu_s) / dr.select(apart, sines, 1.0), -1.0, 1.0), 1.0)
 
 
 def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:

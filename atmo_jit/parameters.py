@@ -68,7 +68,7 @@ def moved(atmosphere: Atmosphere, name: str, direction: float | np.ndarray) -> t
     value = described(atmosphere, name)
     largest = float(np.max(np.abs(value)))
     step = STEP * (largest if largest > 0.0 else 1e-5 if name.endswith("_per_m") else 1.0)
-    step /= float(np.max(np.abs(direction)))
+    step /= float(np.max(np.abs(direction))) or 1.0
     ends = []
     for sign in (-1.0, 1.0):
         try:

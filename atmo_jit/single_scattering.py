@@ -221,5 +221,5 @@ def disc_cosine(mu_s: Any, radius: Any) -> Any:
     """
     x = dr.clip(mu_s / dr.maximum(radius, 1e-7), -1.0, 1.0)
     half = dr.safe_sqrt(1.0 - x * x)
-    part = x * (0.5 + (dr.asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
+    part = x * (0.5 + (dr.safe_asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
     return dr.select(dr.abs(x) < 1.0, radius * dr.maximum(part, 0.0), dr.maximum(mu_s, 0.0))
