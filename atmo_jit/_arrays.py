@@ -16,7 +16,13 @@ def is_drjit(x: Any) -> bool:
 
 
 def module_of(*values: Any) -> Any:
-    """The module whose ``exp``, ``abs``, ``maximum`` fit ``values``: drjit if any is a Dr.Jit array, else numpy."""
+    """The module whose ``exp``, ``abs``, ``maximum`` fit ``values``: drjit if any is a Dr.Jit array, else numpy.
+
+    Other kinds of values bring theirs along as ``array_module``.
+    """
+    for x in values:
+        if hasattr(type(x), "array_module"):
+            return x.array_module
     if any(is_drjit(x) for x in values):
         import drjit as dr
 

@@ -53,6 +53,22 @@ class Field:
         self.scatters = scatters
         self._size = padded(optics.channel_count)
 
+    @classmethod
+    def of(
+        cls, optics: Optics, columns: SunColumns, grid: Grid, degree: int, held: dict[str, Any], *, scatters: bool
+    ) -> Field:
+        """The field that ``held`` came from."""
+        log, inverse, fine = (held[f"reference.{name}"] for name in ("log", "inverse", "fine"))
+        reference = Reference.of(grid, optics.channel_count, {"log": log, "inverse": inverse, "fine": fine})
+        parts = (held[name] for name in ("moments", "sky", "reflected"))
+        return cls(optics, columns, grid, reference, degree, *parts, scatters=scatters)
+
+    @property
+    def held(self) -> dict[str, Any]:
+        """Its numbers, by name."""
+        reference = {f"reference.{name}": value for name, value in self.reference.held.items()}
+        return {"moments": self.moments, "sky": self.sky, "reflected": self.reflected, **reference}
+
     def _refined(self, values: Any, entries: int) -> Any:
         """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically."""
         t, grid, channels = types(), self.grid, self.optics.channel_count

@@ -131,7 +131,7 @@ class Gather:
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 1) * channels)]
         end = dr.opaque(t.UInt, azimuths, 1)
         _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="azimuths")
-        return stored_harmonics(sums, azimuths)
+        return stored_harmonics(sums, channels, azimuths)
 
     def _rows(self, light: Moments, orders: int) -> Any:
         """Moments over the reference as a table [K, S + 2, l, m x channels], irradiance after the last l.

@@ -48,7 +48,7 @@ class Grid(Keeper):
             atmosphere.bottom_radius_m,
             atmosphere.thickness_m,
             atmosphere.sun_angular_radius_deg,
-            *((_profile_key(c.profile), *_matter(atmosphere, c)) for c in atmosphere.constituents),
+            *((profile_key(c.profile), *_matter(atmosphere, c)) for c in atmosphere.constituents),
         )
         if key not in cls._known:
             cls._known[key] = cls(atmosphere, resolution, suns)
@@ -209,7 +209,7 @@ def _matter(atmosphere: Atmosphere, constituent: Constituent) -> tuple[bool, int
     return bool(np.any(constituent.scattering_per_m > 0)), max(-2, round(np.log2(max(depth, 1e-9))))
 
 
-def _profile_key(profile: Any) -> Any:
+def profile_key(profile: Any) -> Any:
     if isinstance(profile, Tabulated):
         return profile.altitude_m.tobytes(), profile.values.tobytes()
     return profile

@@ -290,16 +290,14 @@ def from_horizon_inverse(x: Any, edge: Any, end: Any) -> Any:
     return edge + (end - edge) * x * x
 
 
-def crowded(x: Any, crowding: Any) -> Any:
-    """y = x / 2 (1 + (1 + c) / (1 + c x)): keeps 0 and 1, and spreads what lies about 0, below x = 1 / c, over a
-    quarter of the range without taking more than half of the room of what lies about 1."""
-    return 0.5 * x * (1.0 + (1.0 + crowding) / (1.0 + crowding * x))
+def crowded(x: Any, place: float, knee: float) -> Any:
+    """y, linear from 0 to ``knee`` at x = ``place`` and on to 1 at 1: more room about 0 where place < knee."""
+    return _minimum(x * (knee / place), 1.0 - (1.0 - x) * ((1.0 - knee) / (1.0 - place)))
 
 
-def crowded_inverse(y: Any, crowding: Any) -> Any:
-    """x, the positive root of c x^2 + (2 + c - 2 c y) x - 2 y = 0."""
-    half = 1.0 + crowding * (0.5 - y)
-    return 2.0 * y / (half + _root(half * half + 2.0 * crowding * y))
+def crowded_inverse(y: Any, place: float, knee: float) -> Any:
+    """x of :func:`crowded`."""
+    return _maximum(y * (place / knee), 1.0 - (1.0 - y) * ((1.0 - place) / (1.0 - knee)))
 
 
 def half_azimuth(cos_phi: Any) -> Any:

@@ -24,6 +24,7 @@ from .quadrature import gauss_legendre, running_integral
 NODES = 4  # per piece
 FEW = 4  # per piece, for densities and columns, which are smooth
 MAX_DEPTH = 1.0  # optical depth of a piece: exp(-tau) over it is a polynomial of degree 7 to 1e-7
+MAX_TURN = 0.03  # radians about the planet's centre: the light that scatters again changes with the sun's height
 SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
 
 
@@ -158,6 +159,7 @@ class Cuts:
         self._perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
         self._r_mu = (optics.radius + rays.h) * rays.mu
         self._edges = _sunlight_edges(optics, rays) if sunlit else []
+        self._farthest = MAX_TURN * optics.radius
 
     def first_shell(self) -> Any:
         """The shell that each ray starts in."""
@@ -178,7 +180,8 @@ class Cuts:
                 distance_up(radius, rays.h, rays.mu, target),
             ),
         )
-        limit = d + MAX_DEPTH / dr.maximum(dr.gather(t.Float, self._densest, t.UInt(shell)), 1e-30)
+        longest = MAX_DEPTH / dr.maximum(dr.gather(t.Float, self._densest, t.UInt(shell)), 1e-30)
+        limit = d + dr.minimum(longest, self._farthest)
         end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
         for edge in self._edges:
             end = dr.select(edge > d, dr.minimum(end, edge), end)

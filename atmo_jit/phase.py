@@ -86,7 +86,7 @@ class HenyeyGreenstein(_OneParameter):
     type = "henyey_greenstein"
 
     def _density(self, nu: Any, g: Any) -> Any:
-        return _henyey_greenstein(nu, g)
+        return 0.25 / math.pi * (1.0 - g * g) / _cubed_distance(nu, g)
 
     def _moments(self, order: int) -> list[Any]:
         return _powers(self.g, order)
@@ -107,7 +107,7 @@ class CornetteShanks(_OneParameter):
     type = "cornette_shanks"
 
     def _density(self, nu: Any, g: Any) -> Any:
-        return 1.5 * (1.0 + nu * nu) / (2.0 + g * g) * _henyey_greenstein(nu, g)
+        return 0.375 / math.pi * (1.0 - g * g) / (2.0 + g * g) * (1.0 + nu * nu) / _cubed_distance(nu, g)
 
     def _moments(self, order: int) -> list[Any]:
         peak = _powers(self.g, order + 2)
@@ -293,15 +293,13 @@ def phase_from_dict(phase: Any, wavelengths: int) -> Phase:
         return make(*(phase[key] for key in keys))
 
 
-def _henyey_greenstein(nu: Any, g: Any) -> Any:
-    xp = module_of(nu, g)
-    # 1 + g^2 - 2 g nu, without the cancellation that costs float32 its digits in a sharp forward (or backward) peak.
-    sign = xp.select(g >= 0, 1.0, -1.0) if is_drjit(g) else np.where(np.asarray(g) >= 0, 1.0, -1.0)
-    if xp is not np and not is_drjit(g):
-        sign = float(sign)
-    size = sign * g
-    squared = (1.0 - size) * (1.0 - size) + 2.0 * size * (1.0 - sign * nu)
-    return 0.25 / math.pi * (1.0 - g * g) / (squared * xp.sqrt(squared))
+def _cubed_distance(nu: Any, g: Any) -> Any:
+    """(1 + g^2 - 2 g nu)^(3/2), without the cancellation that costs float32 its digits in a sharp forward (or backward)
+    peak."""
+    xp, size = module_of(nu, g), abs(g)
+    from_peak = xp.fma(-g, nu, size) if xp is not np else size - g * nu
+    squared = 2.0 * from_peak + (1.0 - size) * (1.0 - size)
+    return squared * xp.sqrt(squared)
 
 
 def _powers(g: Any, order: int) -> list[Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, types
+from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, tables_of, types
 from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
@@ -105,24 +105,33 @@ def beam_along(
         cos_turn, sin_turn = packet(device.turns, visit, 2)
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
-        weight, level = row(weights.scattered, i, kinds * channels), dr.gather(t.UInt, device.level, i)
-        new = []
-        for mu, old in zip(turned(i), sums, strict=True):
-            light = beam.at(level, mu)
-            new.append([dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=True))])
-        return i + 1, new
+    def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
+        weight, level = row(weights.scattered, i, kinds * channels) if kinds else [], dr.gather(t.UInt, device.level, i)
+        lights = [beam.at(level, mu) for mu in turned(i)]
+        new = [
+            [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
+            for light, old in zip(lights, sums, strict=True)
+        ]
+        # As a sum, like all that derivatives pass backwards through such a loop.
+        ends = dr.select(i + 1 < stop, t.Float(0.0), 1.0)
+        last = [
+            [dr.fma(ends, value, s) for value, s in zip(light, old, strict=True)]
+            for light, old in zip(lights, last, strict=True)
+        ]
+        return i + 1, new, last
 
-    sums = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * channels)] for _ in range(azimuths)]
-    end = stop - 1
-    if kinds:
-        _, sums = dr.while_loop((start, sums), lambda i, _: i < stop, visit, max_iterations=-1, label="beam")
-    reflected = row(weights.reflected, end, channels)
+    def zeros(count: int) -> list[list[Any]]:
+        return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(azimuths)]
+
+    # Light at the last visit is that of the ground, where the path ends there.
+    state = (start, zeros(kinds * channels), zeros(channels))
+    _, sums, last = dr.while_loop(state, lambda i, *_: i < stop, visit, max_iterations=-1, label="beam")
+    reflected = row(weights.reflected, stop - 1, channels)
     ground = []
-    for mu in turned(end):
-        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, beam.at(t.UInt(0), mu), strict=True)]
+    for mu, light in zip(turned(stop - 1), last, strict=True):
+        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, light, strict=True)]
     scattered = [value for part in sums for value in part] or [t.Float(0.0)]
-    return table_of(scattered, lane), table_of(ground, lane)
+    return tuple(tables_of([scattered, ground], lane))
 
 
 def _suns(grid: Grid) -> Any:
@@ -170,7 +179,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((degree + 1) * channels)]
     end = dr.opaque(t.UInt, azimuths, 1)
     _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="phases")
-    return stored_harmonics(sums, azimuths)
+    return stored_harmonics(sums, channels, azimuths)
 
 
 def _dot(a: list[Any], b: list[Any]) -> Any:

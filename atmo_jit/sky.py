@@ -20,7 +20,7 @@ import numpy as np
 
 from . import __version__
 from .atmosphere import Atmosphere
-from .backend import doubles, floats, types
+from .backend import doubles, floats, types, uints
 from .bundle import Bundle
 from .column import SunColumns, sun_columns
 from .errors import InputError
@@ -33,7 +33,7 @@ from .parameters import check_names
 from .pieces import Pieces, light_along
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
-from .views import check_views
+from .views import check_views, side_by_side
 
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
@@ -45,6 +45,15 @@ class RayLight:
 
     radiance: list[Any]
     transmittance: list[Any]
+
+    def taken(self, places: np.ndarray) -> RayLight:
+        """The rays at ``places`` of these."""
+        index = uints(places)
+
+        def take(values: list[Any]) -> list[Any]:
+            return [v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values]
+
+        return RayLight(take(self.radiance), take(self.transmittance))
 
 
 class _Band:
@@ -61,8 +70,10 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: a tenth of the orders'
-    usual remainder is left out, for derivatives. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
+    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: a
+    tenth of the orders' usual remainder is left out, for derivatives. Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -72,30 +83,39 @@ class Sky:
         tolerance: float = 0.01,
         resolution: Resolution | None = None,
         suns: tuple[float, float] | None = None,
+        layout: Atmosphere | None = None,
+        held: list[dict[str, Any]] | None = None,
         *,
         scattering_too: Collection[str] = (),
         sure: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        self._layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
             raise InputError(f"tolerance: is {tolerance!r}; must be a number between 0 and 1")
-        self.orders, self.tolerance = orders, tolerance
+        self.orders, self.tolerance, self.suns = orders, tolerance, suns
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
-        self._suns = suns
+        bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
+        remainder = 0.1 * tolerance if sure else tolerance
         self._bands: list[_Band] = []
-        for i in range(0, count, MAX_CHANNELS):
-            optics = Optics(self.atmosphere, np.arange(i, min(i + MAX_CHANNELS, count)), scattering_too)
-            columns = sun_columns(optics, self.grid)
-            field = solve(optics, columns, self.grid, self.resolution, orders, 0.1 * tolerance if sure else tolerance)
+        for band, values in zip(bands, held or [None] * len(bands), strict=True):
+            optics = Optics(self.atmosphere, band, scattering_too)
+            if values is None:
+                columns = sun_columns(optics, self.grid)
+                field = solve(optics, columns, self.grid, self.resolution, orders, remainder)
+            else:
+                columns = SunColumns(optics, self.resolution.columns, values["columns"])
+                degree = self.resolution.first_degree
+                field = Field.of(optics, columns, self.grid, degree, values, scatters=orders != 1)
             self._bands.append(_Band(optics, columns, field))
 
     @property
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
-        return Grid.of(self.atmosphere, self.resolution, self._suns)
+        return Grid.of(self._layout, self.resolution, self.suns)
 
     def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
         """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
@@ -120,6 +140,11 @@ class Sky:
         """The same, as they are."""
         return self._bands
 
+    @property
+    def held(self) -> list[dict[str, Any]]:
+        """All numbers of the solution, per band: Floats by name."""
+        return [{"columns": band.columns.table, **band.field.held} for band in self._bands]
+
     def rays(
         self,
         altitude_m: Any,
@@ -134,12 +159,19 @@ class Sky:
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
-        Angles in radians, arrays of one width (Float64 keeps views from far out in space exact; Float works too).
+        Angles in radians, arrays of one width: NumPy's, which are reordered for speed, or Dr.Jit's (Float64 keeps
+        views from far out in space exact; Float works too).
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun). ``pieces``: those of the rays (pieces.Pieces), per band;
         derivatives then pass through.
         """
+        given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
+        if pieces is None and all(isinstance(v, np.ndarray) and v.shape == (len(given[0]),) for v in given):
+            air = self.atmosphere
+            order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
+            light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
+            return light.taken(np.argsort(order))
         rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
@@ -365,11 +397,10 @@ def _march(
 
 def _evaluate(solved: Sky, views: Mapping[str, np.ndarray], ground: bool, sun_disc: bool) -> list[np.ndarray]:
     """The four arrays of a SkyResult for some of its views."""
-    altitude = doubles(views["altitude_m"])
-    angles = [doubles(np.deg2rad(views[name])) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
-    distance = doubles(views["distance_m"]) if "distance_m" in views else None
-    light = solved.rays(altitude, *angles, distance, ground=ground, sun_disc=sun_disc)
-    sun, scattered = solved.irradiance(altitude, angles[0])
+    altitude = views["altitude_m"]
+    angles = [np.deg2rad(views[name]) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
+    light = solved.rays(altitude, *angles, views.get("distance_m"), ground=ground, sun_disc=sun_disc)
+    sun, scattered = solved.irradiance(doubles(altitude), doubles(angles[0]))
     groups = (light.radiance, light.transmittance, sun, scattered)
     dr.eval(groups)
     shape = views["altitude_m"].shape

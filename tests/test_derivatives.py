@@ -1,4 +1,4 @@
-"""Derivatives of the sky by everything it depends on: against differences, against Monte Carlo, forward against reverse,
+"""Derivatives of the sky by everything it depends on: against differences, against Monte Carlo, forward and reverse,
 through Dr.Jit and JAX, and finite wherever geometry is singular."""
 
 from __future__ import annotations

@@ -169,12 +169,11 @@ def test_half_elevation_round_trip_and_ends():
         q = mapping.from_horizon_inverse(x, edge, end)
         assert q[0] == edge and q[-1] == pytest.approx(end)
         assert_close((mapping.from_horizon(q, edge, end),), (x,))
-    for c in (0.0, 1.0, 30.0):
-        y = mapping.crowded(x, c)
-        assert y[0] == 0.0 and y[-1] == 1.0
-        slope = (1.0 - mapping.crowded(1.0 - 1e-6, c)) / 1e-6
-        assert slope == pytest.approx(0.5 + 0.5 / (1.0 + c), abs=1e-3)
-        assert_close((mapping.crowded_inverse(y, c),), (x,))
+    for place, knee in ((0.01, 0.25), (0.3, 0.3), (0.5, 0.6)):
+        y = mapping.crowded(x, place, knee)
+        assert y[0] == 0.0 and y[-1] == 1.0 and mapping.crowded(place, place, knee) == pytest.approx(knee)
+        assert mapping.crowded(0.5 * place, place, knee) == pytest.approx(0.5 * knee)
+        assert_close((mapping.crowded_inverse(y, place, knee),), (x,))
     assert_close((mapping.half_azimuth(mapping.half_azimuth_inverse(x)),), (x,))
     assert_close((mapping.half_azimuth_inverse(x),), (np.cos(2 * np.arcsin(x)),))
 

@@ -68,18 +68,24 @@ class MeanSource:
         """Cosine series in azimuth of the radiance along rays, float32 [A, V, S, azimuthal order, C].
 
         ``h`` [A] (m); ``x`` [A, V]: place between the horizon (0) and zenith or nadir (1) as in :func:`view_cosines`,
-        ``up`` [V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
+        ``up`` [V] or [A, V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
         """
-        a, v, *rest = self.harmonics.shape
-        values = self.harmonics.reshape(a, v, -1)
+        values = np.moveaxis(self.harmonics, 4, 0)  # scatterers apart
+        kinds, a, v, *rest = values.shape
+        values = values.reshape(kinds, a, v, -1)
         if not self.single:
             place = chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0)))
-            values = np.tensordot(place.astype(np.float32), values, 1)
+            values = np.stack([np.tensordot(place.astype(np.float32), kind, 1) for kind in values])
         matrix = np.zeros((*x.shape, v), dtype=np.float32)
+        up = np.broadcast_to(up, x.shape)
         for half, nodes in ((up, slice(0, self.up)), (~up, slice(self.up, v))):
-            matrix[:, half, nodes] = chebyshev_matrix(nodes.stop - nodes.start, x[:, half])
-        mean = (matrix @ values).reshape(*x.shape, *rest)
-        return np.einsum("avsmkc,avkc->avsmc", mean, scattering.astype(np.float32), optimize=True)
+            matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
+        total = np.zeros((*x.shape, *rest), dtype=np.float32)
+        for k, kind in enumerate(values):
+            mean = (matrix @ kind).reshape(*x.shape, *rest)
+            mean *= scattering[:, :, None, None, k].astype(np.float32)
+            total += mean
+        return total
 
 
 def view_cosines(radius: float, thickness: float, h: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:

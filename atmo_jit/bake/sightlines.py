@@ -21,15 +21,13 @@ import numpy as np
 from ..backend import floats, packet, padded, types, uints
 from ..march import relative_azimuth
 from ..optics import Optics
-from ..quadrature import gauss_legendre, running_integral
 from ..single_scattering import horizontal_irradiance
+from .ray_pieces import Nodes, Rays, sums
 from .sunlight import SIZE as SUNLIGHT
 from .sunlight import Sunlight
 
 NODES = 3  # Gauss-Legendre nodes per piece
-MAX_DEPTH = 1.0  # optical depth of a piece
 SPENT_DEPTH = 16.0  # what lies behind 1e-7 of transmittance is not seen
-LONGEST = 32  # pieces into which one shell is cut at most
 
 
 class Sightlines:
@@ -55,129 +53,45 @@ class Sightlines:
         stretches: int = 0,
         nodes: int = NODES,
     ) -> None:
-        self.optics, self.mu, self._parts = optics, mu, stretches
-        radius, top = optics.atmosphere.bottom_radius_m, optics.atmosphere.top_radius_m
-        r = radius + h
-        self.r = r
-        # Altitude first, as in geometry.py: b is the ray's least distance from the centre, on its whole line.
-        sine = np.sqrt((1.0 - mu) * (1.0 + mu))
-        middle = -r * mu  # distance to the perigee
-        levels = optics.breaks_m
-        lowest = h - r * mu * mu / (1.0 + sine)
-        half = np.sqrt(np.maximum((levels - lowest[:, None]) * (2.0 * radius + levels + lowest[:, None]), 0.0))
-        meets = half[:, -1] > 0.0
-        hits = (mu < 0.0) & (lowest < 0.0) if ground is None else np.broadcast_to(ground, mu.shape)
-        end = np.where(hits, np.maximum(middle - half[:, 0], 0.0), middle + half[:, -1])
-        begin = np.maximum(middle - half[:, -1], 0.0) if np.any(r > top) else np.zeros_like(h)
-        end = np.where(meets & (end > begin), end, begin)
-        self.start = begin if start is None else np.clip(start, begin, end)
-        self.stop = end if stop is None else np.clip(stop, self.start, end)
-        self.ground = hits & (self.stop >= end) & (end >= begin)
-        # Shells passed on the way down, from the top on; what lies below the ground, where a ray is told to go on
-        # through it; the shells on the way up.
-        bounds = np.concatenate([middle[:, None] - half[:, ::-1], middle[:, None] + half], axis=1)
-        near, far = bounds[:, :-1], bounds[:, 1:]
-        near, far = (np.clip(d, self.start[:, None], self.stop[:, None]) for d in (near, far))
-        ray, shell = np.nonzero(far > near)
-        self._cut(sine, ray, near[ray, shell], far[ray, shell], nodes)
-
-    def _cut(self, sine: np.ndarray, ray: np.ndarray, near: np.ndarray, far: np.ndarray, nodes: int) -> None:
-        """Pieces thin enough for the quadrature; columns from the start of each ray; weights at the nodes."""
-        optics = self.optics
+        self.optics = optics
         scattering, extinction = _coefficients(optics)
-        few_x, few_w = gauss_legendre(4)
-        density = self._densities(ray, near + (far - near) * few_x[:, None])  # [constituent, node, piece]
-        column = np.einsum("g,kgp->kp", few_w, density) * (far - near)
-        depth = (extinction.T @ column).max(axis=0, initial=0.0)
-        parts = np.clip(np.ceil(depth / MAX_DEPTH), 1, LONGEST).astype(int)
-        which = np.repeat(np.arange(len(ray)), parts)
-        place = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
-        step = (far - near)[which] / parts[which]
-        ray, near = ray[which], near[which] + place * step
-
-        density = self._densities(ray, near + step * few_x[:, None])
-        column = np.einsum("g,kgp->kp", few_w, density) * step
-        before = np.cumsum(column, axis=1) - column
-        first = np.searchsorted(ray, np.arange(len(self.mu)))
-        from_start = before - before[:, np.minimum(first, len(ray) - 1)][:, ray] if len(ray) else before
-        total = np.zeros((len(column), len(self.mu)))
-        np.add.at(total.T, ray, column.T)
-        self.transmittance = np.exp(-(extinction.T @ total)).T
-        seen = (extinction.T @ from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
-        ray, near, step = ray[seen], near[seen], step[seen]
-        from_start, density = from_start[:, seen], density[..., seen]
-        x, w = gauss_legendre(nodes)
-        inner = from_start[:, None] + np.einsum("gf,kfp->kgp", running_integral(4, tuple(x)), density) * step
-        distance = near + step * x[:, None]
-        here = self._densities(ray, distance)
-        through = np.exp(-np.einsum("kc,kgp->gpc", extinction, inner)) * (w[:, None] * step)[..., None]
-        weight = np.einsum("kc,kgp,gpc->pgkc", scattering, here[optics.scatterers], through)
-        self.scattering = np.zeros((len(self.mu), *weight.shape[2:]))
-        np.add.at(self.scattering, ray, weight.sum(axis=1))
-        self._gather_stretches(sine, ray, distance.T, weight)
-        self._nodes = self._table(sine, np.repeat(ray, nodes), distance.T.ravel(), np.repeat(0.5 * step / nodes, nodes))
-        self._weights = _padded_channels(weight.reshape(len(ray) * nodes, *weight.shape[2:]))
-        self._first_node = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)) * nodes)
-        end = self._altitude(np.arange(len(self.mu)), self.stop)[1]
-        self._ends = floats(
-            np.column_stack([(self.r + self.stop * self.mu) / end, self.stop * sine / end, sine, self.mu])
-        )
+        rays = Rays.of(optics, h, mu, start, stop, ground)
+        self.start, self.stop, self.ground = rays.start, rays.stop, rays.ground
+        whole = rays.pieces(extinction)
+        self.transmittance = np.exp(-(extinction.T @ whole.total)).T
+        seen = (extinction.T @ whole.from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
+        at = whole.nodes(seen, nodes)
+        through = np.exp(-np.einsum("kc,kgp->gpc", extinction, at.columns)) * at.length[..., None]
+        weight = np.einsum("kc,kgp,gpc->pgkc", scattering, at.densities[optics.scatterers], through)
+        self.scattering = sums(weight.sum(axis=1), at.first)
+        self._gather_stretches(at, weight, stretches)
+        self._nodes, self._first_node, self._ends = at.table, at.first_node, rays.ends
+        self._weights = _padded_channels(weight.reshape(weight.shape[0] * nodes, *weight.shape[2:]))
         through = np.where(self.ground[:, None], self.transmittance, 0.0)
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
 
-    def _gather_stretches(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, weight: np.ndarray) -> None:
+    def _gather_stretches(self, at: Nodes, weight: np.ndarray, parts: int) -> None:
         """Neighbouring pieces as stretches with about equal shares of what the ray scatters, and the centroid of each.
 
-        ``distance`` [piece, node], ``weight`` [piece, node, scatterer, channel].
+        ``weight`` [piece, node, scatterer, channel]; ``parts``: stretches of a ray, 0: every piece is one.
         """
+        rays, ray, distance = at.rays, at.ray, at.distance.T
         channels = np.maximum(self.scattering.sum(axis=1), 1e-300)
         share = (weight.sum(axis=2) / channels[ray][:, None]).mean(axis=2)
         by_piece = share.sum(axis=1)
-        sums = np.cumsum(by_piece) - 0.5 * by_piece
+        before = np.cumsum(by_piece) - 0.5 * by_piece
         start = (np.cumsum(by_piece) - by_piece)[np.searchsorted(ray, ray)]
-        part = np.clip((sums - start) * self._parts, 0, max(self._parts - 1, 0)).astype(int)
-        rising = distance[:, 0] >= -(self.r * self.mu)[ray]
-        key = (ray * (self._parts + 1) + part) * 2 + rising if self._parts else np.arange(len(ray))
+        part = np.clip((before - start) * parts, 0, max(parts - 1, 0)).astype(int)
+        rising = distance[:, 0] >= rays.middle[ray]
+        key = (ray * (parts + 1) + part) * 2 + rising if parts else np.arange(len(ray))
         first = np.flatnonzero(np.diff(key, prepend=-1))
         total, moment = (np.add.reduceat(v, first) for v in (by_piece, (share * distance).sum(axis=1)))
         ray = ray[first]
         lit = total > 0.0
         centre = np.where(lit, moment / np.where(lit, total, 1.0), distance[first, 0])
-        self._stretches = self._table(sine, ray, centre, np.zeros(len(first)))
+        self._stretches = rays.table(ray, centre, np.zeros(len(first)))
         self._stretch_weights = _padded_channels(np.add.reduceat(weight.sum(axis=1), first))
-        self._first_stretch = uints(np.searchsorted(ray, np.arange(len(self.mu) + 1)))
-
-    def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Altitude and radius (m) of points on rays, [..., len(ray)]."""
-        r, mu = self.r[ray], self.mu[ray]
-        there = np.sqrt(np.maximum(r * r + distance * (2.0 * r * mu + distance), 0.0))
-        return np.maximum(there - self.optics.atmosphere.bottom_radius_m, 0.0), there
-
-    def _densities(self, ray: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        h, constituents = self._altitude(ray, distance)[0], self.optics.constituents
-        return np.array([np.asarray(c.profile.density(h)) for c in constituents]).reshape(len(constituents), *h.shape)
-
-    def _table(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
-        """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's
-        centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in cosines."""
-        atmosphere = self.optics.atmosphere
-        h, r = self._altitude(ray, distance)
-        horizon = -np.sqrt(h * (2.0 * atmosphere.bottom_radius_m + h)) / r
-        disc = np.maximum(np.deg2rad(atmosphere.sun_angular_radius_deg) * atmosphere.bottom_radius_m / r, 1e-7)
-        return floats(
-            np.column_stack(
-                [
-                    np.sqrt(np.clip(h / atmosphere.thickness_m, 0.0, 1.0)) * (SUNLIGHT[0] - 1),
-                    horizon,
-                    1.0 / (1.0 - horizon),
-                    (self.r[ray] + distance * self.mu[ray]) / r,
-                    distance * sine[ray] / r,
-                    np.clip((self.r[ray] * self.mu[ray] + distance) / r, -1.0, 1.0),
-                    half / r,
-                    disc,
-                ]
-            )
-        )
+        self._first_stretch = uints(np.searchsorted(ray, np.arange(len(self.stop) + 1)))
 
     def nu(self, ray: Any, mu_s: Any, across: Any) -> Any:
         """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``, evaluated.

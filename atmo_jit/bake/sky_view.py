@@ -1,9 +1,9 @@
-"""The sky of one observer under one sun as a table over elevation and azimuth: two square roots and one packet load per
-look-up.
+"""The sky of one observer under one sun as a table over elevation and azimuth: some square roots and one packet load
+per look-up.
 
 Latitude is split at the horizon and goes with the square root of the distance to it, azimuth with the sine of its half
-(Hillaire 2020, section 5.3); in place of the elevation stands the sine of its half, which needs no arc functions. A
-cell holds its four corners side by side in half precision.
+(Hillaire 2020, section 5.3); in place of the elevation stands the sine of its half, which needs no arc functions.
+Cells are those of :mod:`.cells`.
 
 A forward peak would need many cells. So each peaked scatterer has a channel of its own: its single scattering without
 phase function, the mean over the wavelengths. At look-up that is multiplied by the phase function and by the colour it
@@ -20,18 +20,18 @@ import drjit as dr
 import numpy as np
 
 from .. import mapping
-from ..backend import floats, packet, padded, parameter, types, uints
+from ..backend import floats, packet, padded, parameter, stored, types, uints
 from ..phase import Isotropic, RayleighPhase
-from .mean_source import MeanSource, view_cosines, view_range
+from .cells import Cells
+from .mean_source import MeanSource, Series, view_cosines, view_range
 from .sightlines import Sightlines
 from .sunlight import Sunlight
 
-SIZE = (96, 64, 64)  # rows above the horizon, rows below, columns
+SIZE = (96, 80, 64)  # rows above the horizon, rows below, columns
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
-SMALLEST_DIP = 0.01  # unit latitude; of an observer some centimetres above the ground
+CROWDED = (0.1, 0.9)  # unit latitude below which rows crowd: of an observer some centimetres above the ground, far up
 OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
-LARGEST_HALF = 3e4  # tables are scaled to this: half precision then is exact to 0.05 % over nine decades
 
 
 @dataclass
@@ -66,12 +66,13 @@ class Nodes:
 
 @dataclass
 class NodeLight:
-    """Light at the nodes of a table, arrays [rows, columns, C]: ``smooth`` without the single scattering of peaked
-    scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance`` [rows, C]."""
+    """Light at the nodes of a table, a Float [rows x columns] per channel: ``smooth`` without the single scattering of
+    peaked scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance``: a Float
+    [rows] per channel."""
 
-    smooth: np.ndarray
-    peaks: dict[int, np.ndarray]
-    transmittance: np.ndarray
+    smooth: list[Any]
+    peaks: dict[int, list[Any]]
+    transmittance: list[Any]
 
 
 class SkyView:
@@ -96,26 +97,27 @@ class SkyView:
         up_count, down_count, columns = size
         edge, end = view_range(air.bottom_radius_m, air.thickness_m, np.array(self.altitude_m))
         # Below the horizon light changes with the distance to the ground, and so on the scale of the horizon's dip.
+        # Rows crowd up to the geometric middle of that and the whole half. A node lies where their density changes.
         dip = mapping.from_horizon(2.0 * edge, edge, -mapping.STEEPEST)
-        crowding = float(1.0 / max(dip, SMALLEST_DIP))
-        below = mapping.crowded_inverse(mapping.texels(down_count), crowding)
+        place = float(np.clip(1.4 * np.sqrt(dip), *CROWDED))
+        knee = max(round((0.45 + 0.55 * place) * (down_count - 1)) / (down_count - 1), place)
+        below = mapping.crowded_inverse(mapping.texels(down_count), place, knee)
         x = np.maximum(np.concatenate([mapping.texels(up_count), below]), OFF_EDGE)
         up = np.arange(len(x)) < up_count
         mu = view_cosines(air.bottom_radius_m, air.thickness_m, np.array([[self.altitude_m]]), x, up)[0]
         cos_phi = mapping.half_azimuth_inverse(mapping.texels(columns))
         nodes = Nodes(self.altitude_m, x, mu, up, cos_phi, float(np.cos(sun_zenith)))
         self._edge = parameter(edge)
-        self._per_range_up, self._per_range_down = (
-            parameter(1.0 / (end - edge)),
-            parameter(1.0 / (edge + mapping.STEEPEST)),
-        )
+        self._per_range = (parameter(1.0 / (end - edge)), parameter(1.0 / (edge + mapping.STEEPEST)))
         self._limb = bool(end < mapping.STEEPEST)
-        self._crowding, self._up = parameter(crowding), parameter(up_count - 1.0)
-        self._down, self._crowded = parameter(0.5 * (down_count - 1.0)), parameter(1.0 + crowding)
+        self._steep = (parameter(up_count - 1.0), parameter(knee / place * (down_count - 1.0)))
+        flat = (1.0 - knee) / (1.0 - place)
+        self._flat = (parameter(up_count - 1.0), parameter(flat * (down_count - 1.0)))
+        self._start = (parameter(0.0), parameter((1.0 - flat) * (down_count - 1.0)))
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
         light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
-        self._bands = [_Table.of(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
+        self._bands = [_Table(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
 
     def radiance(self, view_zenith: Any, azimuth: Any) -> list[Any]:
         """W Floats: radiance toward views at these angles (rad), ``azimuth`` from the sun's."""
@@ -126,10 +128,10 @@ class SkyView:
 
     def along(self, x: Any, y: Any, z: Any) -> list[Any]:
         """The same for unit vectors with z up and the sun above or below the x axis."""
-        square = dr.maximum(dr.fma(x, x, y * y), 1e-24)
-        inverse = dr.rsqrt(square)
-        up, latitude = self._latitude(z, square * inverse)
-        column = dr.sqrt(dr.maximum(dr.fma(x * inverse, -0.5, 0.5), 0.0)) * self._columns
+        # The cosine of elevation from z and not from x and y: both roots are then taken at once.
+        up, latitude = self._latitude(z, dr.sqrt(dr.maximum(dr.fma(-z, z, 1.0), 0.0)))
+        cos_phi = x * dr.rsqrt(dr.maximum(dr.fma(x, x, y * y), 1e-24))
+        column = dr.sqrt(dr.maximum(dr.fma(cos_phi, -0.5, 0.5), 0.0)) * self._columns
         nu = dr.fma(z, self._mu_s, x * self._sin_s)
         row = self._row(up, latitude)
         found = [v for table in self._bands for v in table.at(up, row, column, nu)]
@@ -144,16 +146,16 @@ class SkyView:
         return [dr.select(up & (latitude > 1.0), 1.0, v) for v in found] if self._limb else found
 
     def _row(self, up: Any, latitude: Any) -> Any:
-        """Fractional row of a half of the table."""
-        x = dr.minimum(latitude, 1.0)
-        below = dr.fma(self._crowded, dr.rcp(dr.fma(x, self._crowding, 1.0)), 1.0) * self._down
-        return x * dr.select(up, self._up, below)
+        """Fractional row of a half of the table: mapping.crowded of the latitude, with the least arithmetic."""
+        x = dr.minimum(latitude, 1.0) if self._limb else latitude
+        steep, flat, start = (dr.select(up, *halves) for halves in (self._steep, self._flat, self._start))
+        return dr.minimum(x * steep, dr.fma(x, flat, start))
 
     def _latitude(self, z: Any, across: Any) -> tuple[Any, Any]:
         """Whether a view of sine ``z`` and cosine ``across`` of elevation looks above the horizon, and its unit
         latitude: mapping.from_horizon of mapping.half_elevation, with the least arithmetic."""
         q = dr.fma(z, dr.rsqrt(dr.fma(2.0, across, 2.0)), -self._edge)
-        return q >= 0.0, dr.sqrt(dr.abs(q) * dr.select(q >= 0.0, self._per_range_up, self._per_range_down))
+        return q >= 0.0, dr.sqrt(dr.abs(q) * dr.select(q >= 0.0, *self._per_range))
 
     @property
     def nbytes(self) -> int:
@@ -164,52 +166,28 @@ class SkyView:
 class _Table:
     """One band's cells and the rows of its transmittance."""
 
-    @classmethod
-    def of(cls, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> _Table:
-        """Peaks taken apart, as the module says."""
-        values, colours, greys = light.smooth, [], []
-        nu = floats(nodes.nu)
-        for k, single in light.peaks.items():
-            phase = optics.phase_values(k, nu)
-            dr.eval(phase)
-            value = np.stack([np.broadcast_to(p.numpy(), nodes.nu.size) for p in phase], axis=-1)
-            grey = single.mean(axis=-1)
-            in_sun = single[nodes.sun_row, 0]
-            colour = in_sun / in_sun.mean() if in_sun.mean() > 0.0 else np.zeros_like(in_sun)
-            values = values + (single - grey[..., None] * colour) * value.reshape(single.shape)
-            colours.append([parameter(c) for c in colour])
-            greys.append(grey[..., None])
-        values = np.concatenate([values, *greys], axis=-1)
-        return cls(optics, values, size, list(light.peaks), colours, light.transmittance)
-
-    def __init__(
-        self,
-        optics: Any,
-        values: np.ndarray,
-        size: tuple[int, int, int],
-        peaks: list[int],
-        colours: list[list[Any]],
-        transmittance: np.ndarray,
-    ) -> None:
-        self.optics, self.peaks, self.colours = optics, peaks, colours
+    def __init__(self, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> None:
+        self.optics, self.peaks = optics, list(light.peaks)
         self.channels = optics.channel_count
-        self.count = 1 << (values.shape[-1] - 1).bit_length()
-        self.up, self.down, self.columns = size
-        largest = float(np.abs(values).max())
-        scale = LARGEST_HALF / largest if largest > 0.0 else 1.0
-        self.unit = parameter(1.0 / scale)
-        # Of every cell the four coefficients of v + v_x x + (v_y + v_xy x) y. Cells beyond the last node of a row or
-        # column are constant: rounding may lead there.
-        v = np.pad(values * scale, ((0, 0), (0, 0), (0, self.count - values.shape[-1])))
-        by_column = np.diff(v, axis=1, append=v[:, -1:])
-        last = np.isin(np.arange(len(v)), (self.up - 1, len(v) - 1))[:, None, None]
-        by_row, by_both = (np.where(last, 0.0, np.diff(a, axis=0, append=a[-1:])) for a in (v, by_column))
-        cells = np.concatenate([v, by_column, by_row, by_both], axis=-1).astype(np.float16)
-        self.cells = types().Float16(np.ascontiguousarray(cells).ravel())
-        extra = ((0, 0), (0, padded(self.channels) - self.channels))
-        self.rows = floats(np.pad(transmittance, extra))
-        dr.eval(self.cells, self.rows)
-        self.nbytes = 2 * dr.width(self.cells) + 4 * dr.width(self.rows)
+        self.up, self.down, columns = size
+        values, self.colours, greys = light.smooth, [], []
+        nu = floats(nodes.nu)
+        # Peaks taken apart, as the module says.
+        toward_sun = uints([nodes.sun_row * columns])
+        for k, single in light.peaks.items():
+            grey = sum(single) / self.channels
+            in_sun = [dr.gather(types().Float, v, toward_sun) for v in single]
+            mean = dr.maximum(sum(in_sun) / self.channels, 1e-30)
+            colour = [v / mean for v in in_sun]
+            parts = zip(values, single, colour, optics.phase_values(k, nu), strict=True)
+            values = [dr.fma(s - grey * shade, phase, v) for v, s, shade, phase in parts]
+            self.colours.append(colour)
+            greys.append(grey)
+        self.cells = Cells([*values, *greys], columns, (self.up, self.down))
+        lane = dr.arange(types().UInt, self.up + self.down)
+        self.rows = stored(light.transmittance, lane, padded(self.channels))
+        dr.eval(self.colours)
+        self.nbytes = self.cells.nbytes + 4 * dr.width(self.rows)
 
     def _row(self, up: Any, row: Any) -> tuple[Any, Any]:
         """First row of the cell (those below the horizon follow those above), and the fraction."""
@@ -218,20 +196,13 @@ class _Table:
 
     def at(self, up: Any, row: Any, column: Any, nu: Any) -> list[Any]:
         """Radiance per channel at a fractional row of either half and a fractional column."""
-        t, n = types(), self.count
-        i, fy = self._row(up, row)
-        j = t.Int(column)
-        fx = column - t.Float(j)
-        cell = t.UInt(dr.fma(i, self.columns, j))
-        c = [t.Float(v) for v in dr.gather(t.ArrayXf16, self.cells, cell, shape=(4 * n, dr.width(cell)))]
-        value = [
-            self.unit * dr.fma(dr.fma(c[3 * n + k], fx, c[2 * n + k]), fy, dr.fma(c[n + k], fx, c[k]))
-            for k in range(self.channels + len(self.peaks))
-        ]
+        i, y = self._row(up, row)
+        j = types().Int(column)
+        value = self.cells.at(i, y, j, column - types().Float(j))
         radiance = value[: self.channels]
         for k, grey, colour in zip(self.peaks, value[self.channels :], self.colours, strict=True):
             phase = self.optics.phase_values(k, nu)
-            radiance = [dr.fma(p * shade, grey, v) for p, shade, v in zip(phase, colour, radiance, strict=True)]
+            radiance = [dr.fma(p * grey, shade, v) for p, shade, v in zip(phase, colour, radiance, strict=True)]
         return [dr.maximum(v, 0.0) for v in radiance]
 
     def through(self, up: Any, row: Any) -> list[Any]:
@@ -252,28 +223,29 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
     sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
     sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
     nu = lines.nu(ray, sun, across)
-    smooth = np.zeros((*shape, optics.channel_count))
-    if ground:  # only rows below the horizon meet it
-        below = np.flatnonzero(~nodes.up)
-        glow_ray = uints(np.repeat(below, shape[1]))
-        glow_across = floats(np.broadcast_to(sin_s * nodes.cos_phi, (len(below), shape[1])))
-        glow = lines.ground_light(band, glow_ray, floats(np.full(glow_across.shape[0], nodes.mu_s)), glow_across)
-        smooth[below] = channels_last(glow, (len(below), shape[1]))
+    smooth = [dr.zeros(types().Float, dr.width(ray)) for _ in range(optics.channel_count)]
+    if ground:  # only rows below the horizon meet it; they are the last
+        first = int(np.count_nonzero(nodes.up)) * shape[1]
+        below = dr.arange(types().UInt, first, dr.width(ray))
+        parts = (dr.gather(type(v), v, below) for v in (ray, sun, across))
+        for v, glow in zip(smooth, lines.ground_light(band, *parts), strict=True):
+            dr.scatter(v, glow, below)
+        dr.eval(smooth)
     if band.source is not None:
         whole = lines.scattering.reshape(1, *lines.scattering.shape)
         source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))
-        series = source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0]
-        m = np.arange(series.shape[1])[:, None]
-        smooth = smooth + np.einsum("vmc,mp->vpc", series, np.cos(m * np.arccos(np.clip(nodes.cos_phi, -1.0, 1.0))))
+        series = Series(source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0])
+        more = series.at(ray, floats(np.broadcast_to(nodes.cos_phi, shape)))
+        smooth = [v + m for v, m in zip(smooth, more, strict=True)]
     peaks = {}
     singles = lines.single(Sunlight(optics, band.columns), ray, sun, across, nu) if optics.scatterers else []
     for k, single in zip(optics.scatterers, singles, strict=True):
         if is_peaked(optics.constituents[k]):
-            peaks[k] = channels_last(single, shape)
+            peaks[k] = single
         else:
-            values = zip(single, optics.phase_values(k, nu), strict=True)
-            smooth = smooth + channels_last([s * p for s, p in values], shape)
-    return NodeLight(smooth, peaks, lines.transmittance)
+            values = zip(single, optics.phase_values(k, nu), smooth, strict=True)
+            smooth = [dr.fma(s, p, v) for s, p, v in values]
+    return NodeLight(smooth, peaks, [floats(c) for c in lines.transmittance.T])
 
 
 def is_peaked(constituent: Any) -> bool:

@@ -26,7 +26,7 @@ from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
 from .mean_source import MeanSource, Series, view_cosines
 from .sightlines import Sightlines
-from .sky_view import NodeLight, Nodes, channels_last, is_peaked
+from .sky_view import NodeLight, Nodes, is_peaked
 from .sunlight import Sunlight
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
@@ -97,21 +97,33 @@ class Tables4D:
     def light_at(self, band: _Band4D, nodes: Nodes, ground: bool) -> NodeLight:
         """Light at the nodes of a SkyView inside the atmosphere: what it needs to be made from these tables."""
         rows, columns = nodes.shape
-        mu, up = (np.repeat(v, columns) for v in (nodes.mu, nodes.up))
-        optics = band.optics
-        h = floats(np.full(mu.size, nodes.h))
-        rays = rays_to_boundary(optics, h, floats(mu), floats(np.full(mu.size, nodes.mu_s)), floats(nodes.nu))
-        rays.ground = types().Bool(~up)
+        t, optics, nu = types(), band.optics, nodes.nu
+        mu = np.broadcast_to(nodes.mu[:, None], nodes.shape)
+
+        def rays_from(first: int) -> Rays:
+            """The rays from row ``first`` on."""
+            constant = (np.full(mu[first:].shape, v) for v in (nodes.h, nodes.mu_s))
+            h, mu_s = map(floats, constant)
+            rays = rays_to_boundary(optics, h, floats(mu[first:]), mu_s, floats(nu[first:]))
+            rays.ground = t.Bool(np.repeat(~nodes.up[first:], columns))
+            return rays
+
+        rays = rays_from(0)
         smooth, peaks, through = band.parts(rays, self._place(rays))
-        if ground:
-            glow = ground_light(optics, band.band.columns, rays, band.band.field)
-            smooth = [dr.fma(v, g, s) for v, g, s in zip(through, glow, smooth, strict=True)]
         dr.eval(smooth, peaks, through)
+        if ground:
+            first = int(np.count_nonzero(nodes.up))  # those below the horizon are the last
+            below = dr.arange(t.UInt, first * columns, rows * columns)
+            glow = ground_light(optics, band.band.columns, rays_from(first), band.band.field)
+            for s, v, g in zip(smooth, through, glow, strict=True):
+                dr.scatter(s, dr.fma(dr.gather(t.Float, v, below), g, dr.gather(t.Float, s, below)), below)
+            dr.eval(smooth)
         kinds = [optics.scatterers[n] for n in band.peaks]
+        row = dr.arange(t.UInt, rows) * columns
         return NodeLight(
-            channels_last(smooth, nodes.shape),
-            {k: channels_last(light, nodes.shape) for k, light in zip(kinds, peaks, strict=True)},
-            channels_last(through, nodes.shape)[:, 0],
+            smooth,
+            dict(zip(kinds, peaks, strict=True)),
+            [dr.gather(t.Float, v, row) for v in through],
         )
 
     @property
