@@ -35,6 +35,9 @@ from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views
 
+# Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
+# stand for those left out, carry none.
+SURE = 0.003
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
@@ -61,8 +64,8 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: a tenth of the orders'
-    usual remainder is left out, for derivatives. Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: more orders are
+    solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -89,7 +92,7 @@ class Sky:
         for i in range(0, count, MAX_CHANNELS):
             optics = Optics(self.atmosphere, np.arange(i, min(i + MAX_CHANNELS, count)), scattering_too)
             columns = sun_columns(optics, self.grid)
-            field = solve(optics, columns, self.grid, self.resolution, orders, 0.1 * tolerance if sure else tolerance)
+            field = solve(optics, columns, self.grid, self.resolution, orders, SURE * tolerance if sure else tolerance)
             self._bands.append(_Band(optics, columns, field))
 
     @property
