@@ -35,6 +35,9 @@ from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views, side_by_side
 
+# Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
+# stand for those left out, carry none.
+SURE = 0.003
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
@@ -72,8 +75,8 @@ class Sky:
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
     be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
     used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
-    :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: a
-    tenth of the orders' usual remainder is left out, for derivatives. Raises AtmosphereError, LLVMError, InputError.
+    :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
+    orders are solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -99,7 +102,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        remainder = 0.1 * tolerance if sure else tolerance
+        remainder = SURE * tolerance if sure else tolerance
         self._bands: list[_Band] = []
         for band, values in zip(bands, held or [None] * len(bands), strict=True):
             optics = Optics(self.atmosphere, band, scattering_too)
