@@ -131,7 +131,7 @@ def _scattering(band: Any, to: Bruneton, size: tuple[int, int, int, int]) -> lis
     dr.eval(ray, cosine, across, nu)
 
     def array(values: list[Any]) -> np.ndarray:
-        return dr.ravel(t.ArrayXf(values), order="F").numpy().reshape(*size, -1)
+        return np.stack([v.numpy() for v in values], axis=-1).reshape(*size, -1)
 
     blank = np.zeros((*size, optics.channel_count), dtype=np.float32)
     single = lines.single(Sunlight(optics, band.columns), ray, cosine, across, nu)

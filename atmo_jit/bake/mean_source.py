@@ -68,7 +68,7 @@ class MeanSource:
         """Cosine series in azimuth of the radiance along rays, float32 [A, V, S, azimuthal order, C].
 
         ``h`` [A] (m); ``x`` [A, V]: place between the horizon (0) and zenith or nadir (1) as in :func:`view_cosines`,
-        ``up`` [V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
+        ``up`` [V] or [A, V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
         """
         altitudes, channels, kinds, v, suns, orders = self.harmonics.shape
         values = self.harmonics.reshape(altitudes, -1)
@@ -76,8 +76,9 @@ class MeanSource:
             place = chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0)))
             values = place.astype(np.float32) @ values
         matrix = np.zeros((*x.shape, v), dtype=np.float32)
+        up = np.broadcast_to(up, x.shape)
         for half, nodes in ((up, slice(0, self.up)), (~up, slice(self.up, v))):
-            matrix[:, half, nodes] = chebyshev_matrix(nodes.stop - nodes.start, x[:, half])
+            matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
         # All at once, scatterers added up: one product of matrices per altitude and channel.
         weights = np.einsum("avkc,avn->acvkn", scattering.astype(np.float32), matrix)
         sums = weights.reshape(len(h), channels, -1, kinds * v) @ values.reshape(len(h), channels, kinds * v, -1)

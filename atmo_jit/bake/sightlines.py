@@ -23,7 +23,6 @@ from ..march import relative_azimuth
 from ..optics import Optics
 from ..single_scattering import horizontal_irradiance
 from .ray_pieces import Nodes, Rays, sums
-from .sunlight import SIZE as SUNLIGHT
 from .sunlight import Sunlight
 
 NODES = 3  # Gauss-Legendre nodes per piece
@@ -137,12 +136,12 @@ class Sightlines:
         t = types()
         kinds, channels = len(self.optics.scatterers), self.optics.channel_count
         size = padded(channels)
-        per_row = self.optics.thickness / (SUNLIGHT[0] - 1.0) ** 2
+        thickness = self.optics.thickness
 
         def stretch(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
+            root, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
             there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
-            toward = source.scattered(row * row * per_row, there, mu, relative_azimuth(mu, there, nu), True)
+            toward = source.scattered(root * root * thickness, there, mu, relative_azimuth(mu, there, nu), True)
             weight = packet(self._stretch_weights, i, kinds * size)
             for n in range(kinds):
                 for c in range(channels):
