@@ -27,7 +27,7 @@ TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
 SCATTERING = (32, 128, 8, 32)  # altitudes, view cosines, scattering angles, sun cosines
 # Quadrature nodes per piece of a ray, for suns above and below a cosine: what keeps 99 % of all texels within 0.3 %.
-TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 16
+TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 12
 
 
 @dataclass
