@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, row_size, stored, table, table_of, types, uints
+from .backend import evaluated, floats, packet, row, row_size, stored, table, table_of, types, uints
 from .geometry import safe_sine
 from .grid import Grid, cubic
 from .harmonics import legendre, pair_index, pairs
@@ -170,8 +170,7 @@ class Gather:
         inverse = dr.gather(t.Float, self.reference.inverse, self.reference.index(k, there, channel), held)
         mirrored = dr.select(sun == 0, dr.gather(t.Float, sign, entry), 1.0)
         values = value * inverse * mirrored
-        dr.eval(values)
-        return values
+        return evaluated(values)
 
 
 def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:

@@ -41,7 +41,7 @@ class Sunbeam:
 
         def beams() -> Any:
             lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
-            h = dr.gather(t.Float, floats(paths.levels), lane // self.COSINES)
+            h = dr.gather(t.Float, paths.kept("levels", lambda: floats(paths.levels)), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
             seen = visible_sun(optics, h, optics.radius + h, mu_s)
             return table_of([seen, *columns.toward(h, mu_s)], lane)
@@ -107,14 +107,20 @@ def beam_along(
         cos_turn, sin_turn = packet(device.turns, visit, 2)
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[list[Any]], _: list[list[Any]]) -> tuple[Any, ...]:
+    def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
         weight, level = row(weights.scattered, i, kinds * channels) if kinds else [], dr.gather(t.UInt, device.level, i)
         lights = [beam.at(level, mu) for mu in turned(i)]
         new = [
             [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
             for light, old in zip(lights, sums, strict=True)
         ]
-        return i + 1, new, lights
+        # As a sum, like all that derivatives pass backwards through such a loop.
+        ends = dr.select(i + 1 < stop, t.Float(0.0), 1.0)
+        last = [
+            [dr.fma(ends, value, s) for value, s in zip(light, old, strict=True)]
+            for light, old in zip(lights, last, strict=True)
+        ]
+        return i + 1, new, last
 
     def zeros(count: int) -> list[list[Any]]:
         return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(together)]
@@ -241,5 +247,5 @@ def disc_cosine(mu_s: Any, radius: Any) -> Any:
     """
     x = dr.clip(mu_s / dr.maximum(radius, 1e-7), -1.0, 1.0)
     half = dr.safe_sqrt(1.0 - x * x)
-    part = x * (0.5 + (dr.asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
+    part = x * (0.5 + (dr.safe_asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
     return dr.select(dr.abs(x) < 1.0, radius * dr.maximum(part, 0.0), dr.maximum(mu_s, 0.0))

@@ -7,7 +7,7 @@ Run from the repository root::
     python -m bench.tables --part sky-view|4d|froxels|time
 
 Errors are those of :mod:`atmo_jit.bake.error`: at random views half a degree off the horizon, relative, in per cent.
-Times are medians of warm kernels; CPU time is that of all threads.
+Times are medians of warm kernels; CPU time is that of all threads, waiting ones included.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import drjit as dr
 import numpy as np
 
 from atmo_jit import mapping
+from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles, floats, types
 from atmo_jit.bake.client import SCATTERING, bruneton_tables
 from atmo_jit.bake.error import Error, froxels_error, sky_view_error, tables_error
@@ -31,8 +32,12 @@ from atmo_jit.bake.froxels import Froxels
 from atmo_jit.bake.sky_view import SIZE, SkyView
 from atmo_jit.bake.tables import Size, Tables4D
 from atmo_jit.mapping import Hillaire, texels
+from atmo_jit.needs import Needs
 from atmo_jit.phase import RayleighPhase
+from atmo_jit.plan import plan
 from atmo_jit.sky import RayLight, Sky
+
+from .cost import timed
 
 Row = dict[str, object]
 
@@ -170,18 +175,6 @@ def camera() -> np.ndarray:
     return np.array([[forward + side * right + lift * up for side in (-1, 1)] for lift in (1, -1)])
 
 
-def timed(work: Callable[[], object], repeats: int = 9) -> tuple[float, float]:
-    """Median wall and CPU milliseconds, after one call that is not counted."""
-    work()
-    runs = []
-    for _ in range(repeats):
-        cpu, wall = time.process_time(), time.perf_counter()
-        work()
-        runs.append((time.perf_counter() - wall, time.process_time() - cpu))
-    wall, cpu = (1e3 * float(np.median(column)) for column in zip(*runs, strict=True))
-    return wall, cpu
-
-
 def times(name: str) -> Iterator[Row]:
     """Milliseconds of baking and of a picture."""
     t = types()
@@ -200,9 +193,10 @@ def times(name: str) -> Iterator[Row]:
     suns = iter(0.3 + 1e-3 * np.arange(100_000))
     tables = Tables4D(sky)
     scattering = sky.atmosphere.mie[0].scattering_per_m
+    planned = plan(name, Needs.of_observer(name, 1.0, 45.0))
 
-    def another() -> Sky:
-        return Sky(sky.atmosphere.replace({"mie.scattering_per_m": scattering * (1.0 + next(suns))}))
+    def another() -> Atmosphere:
+        return sky.atmosphere.replace({"mie.scattering_per_m": scattering * (1.0 + next(suns))})
 
     def march(count: int = 20_000) -> None:
         rng = np.random.default_rng(0)
@@ -217,14 +211,15 @@ def times(name: str) -> Iterator[Row]:
         "1280 x 720 picture from a sky view": lambda: picture(view),
         "1280 x 720 picture from the 4-D tables": lambda: picture(SkyView(tables, 1.0, next(suns))),
         "sky view baked, 1280 x 720 picture": lambda: picture(SkyView(sky, 1.0, next(suns))),
-        "the same after a change of the atmosphere": lambda: picture(SkyView(another(), 1.0, next(suns))),
+        "the same after a change of the atmosphere": lambda: picture(SkyView(Sky(another()), 1.0, next(suns))),
+        "the same, one sun, as planned": lambda: picture(SkyView(planned.solve(another()), 1.0, np.radians(45.0))),
         "4-D tables baked": lambda: Tables4D(sky),
         "Bruneton's tables at clients' sizes baked": lambda: bruneton_tables(sky),
         "froxels baked": lambda: Froxels.frustum(sky, 1.0, next(suns), camera()),
     }
     for what, do in work.items():
-        wall, cpu = timed(do, 5 if "baked" in what else 15)
-        yield {"what": what, "where": name, "wall_ms": wall, "cpu_ms": cpu}
+        found = timed(do, 5 if "baked" in what else 31)
+        yield {"what": what, "where": name, "wall_ms": 1e3 * found["wall_s"], "cpu_ms": 1e3 * found["cpu_s"]}
 
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {

@@ -21,6 +21,7 @@ from .parameters import Scalar
 from .problem import Evaluation, Problem
 
 NARROWED = 0.5  # averaging kernel below which the prior knows more than the data
+WIDE = 0.25  # part of the range between the bounds that an interval spans if little is known
 ALIKE = 0.9  # correlation, by the data alone, from which on two parameters cannot be told apart
 
 
@@ -54,7 +55,9 @@ def uncertainty(problem: Problem, u: np.ndarray, found: Evaluation) -> Uncertain
     kernel = np.diag(_inverse(weighed + told + bounds) @ weighed).clip(0.0, 1.0)
     errors, model_error = (np.sqrt(np.diag(m)) for m in (inverse, with_model_error))
     values = problem.values(u)
-    alone = _correlation(_inverse(weighed + 1e-12 * np.diag(np.diag(weighed))))
+    # What the data tell by themselves; factors of single wavelengths stay small by their priors.
+    kept = np.diag([np.sum(priors[:, i] ** 2) * (s.wavelength_nm is not None) for i, s in enumerate(scalars)])
+    alone = _correlation(_inverse(weighed + kept))
     sentences = _sentences(scalars, values, kernel, alone, model_error * np.abs(by_z))
     return Uncertainty(
         inverse * by_z * by_z[:, None],
@@ -107,7 +110,7 @@ def _sentences(
             continue
         low, high = scalar.interval(values[i], model_error[i])
         ends = [np.log(v) if scalar.logarithmic else v for v in (low, high, scalar.low, scalar.high)]
-        if scalar.bounded and ends[1] - ends[0] > 0.5 * (ends[3] - ends[2]):
+        if scalar.bounded and ends[1] - ends[0] > WIDE * (ends[3] - ends[2]):
             found.append(
                 f"{scalar.name} is not identifiable: with the model's errors anything from {low:.3g} to {high:.3g} is "
                 "possible."

@@ -16,7 +16,6 @@ from ..grid import profile_key
 from ..march import MAX_TURN
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
-from .sunlight import SIZE as SUNLIGHT
 
 MAX_DEPTH = 1.0  # optical depth of a piece
 LONGEST = 32  # pieces into which one shell is cut at most
@@ -115,8 +114,9 @@ class Rays:
         return np.array(found).reshape(len(self._profiles), *h.shape)
 
     def table(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
-        """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's
-        centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in cosines."""
+        """Per point: square root of the unit altitude, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn
+        about the planet's centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in
+        cosines."""
         air = self._air
         h, r = self._altitude(ray, distance)
         horizon = -np.sqrt(h * (2.0 * air.bottom_radius_m + h)) / r
@@ -124,7 +124,7 @@ class Rays:
         return floats(
             np.column_stack(
                 [
-                    np.sqrt(np.clip(h / air.thickness_m, 0.0, 1.0)) * (SUNLIGHT[0] - 1),
+                    np.sqrt(np.clip(h / air.thickness_m, 0.0, 1.0)),
                     horizon,
                     1.0 / (1.0 - horizon),
                     (self.r[ray] + distance * self.mu[ray]) / r,

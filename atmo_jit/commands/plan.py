@@ -67,7 +67,8 @@ def _of_views(
     atmosphere: str, views: Path, tolerance: float, orders: int | None, free: tuple[str, ...], ground: bool, disc: bool
 ) -> tuple[Plan, dict[str, Any]]:
     from atmo_jit.atmosphere import Atmosphere
-    from atmo_jit.plan import Needs, plan
+    from atmo_jit.needs import Needs
+    from atmo_jit.plan import plan
     from atmo_jit.views import load_views
 
     air, rays = Atmosphere.load(atmosphere), load_views(views)
@@ -80,7 +81,8 @@ def _of_scene(
     scene: str, definitions: tuple[str, ...], variant: str, tolerance: float, free: tuple[str, ...]
 ) -> tuple[Plan, dict[str, Any]]:
     from atmo_jit.commands.render import _mitsuba, _parameters
-    from atmo_jit.plan import Needs, plan
+    from atmo_jit.needs import Needs
+    from atmo_jit.plan import plan
     from atmo_jit.scenes import find
 
     path, parameters = find(scene), _parameters(definitions)
@@ -105,6 +107,8 @@ def checked(made: Plan, asked: dict[str, Any]) -> dict[str, Any]:
     """
     import resource
 
+    import numpy as np
+
     from atmo_jit.backend import floats
     from atmo_jit.plan import compared
 
@@ -112,7 +116,7 @@ def checked(made: Plan, asked: dict[str, Any]) -> dict[str, Any]:
     for _ in range(2):
         start = time.process_time()
         sky = made.solve()
-        _finish(sky.irradiance(floats([0.0]), floats([0.0])))
+        _finish(sky.irradiance(floats([0.0]), floats(np.radians(made.needs.suns_deg[:1]))))
         solve = time.process_time() - start
         start = time.process_time()
         _evaluate(made, sky, asked)
