@@ -323,7 +323,7 @@ def test_rays_come_in_the_order_in_which_they_were_asked():
 
 
 def test_later_orders_at_the_terminator_seen_from_space(monkeypatch):
-    """Long pieces of a limb ray see many suns: uncut they are 27 % off, and cut eight times finer they change by 8 %."""
+    """Long pieces of limb rays see many suns: uncut they are 27 % off; cut eight times finer they change by 8 %."""
     solved = Sky("earth", tolerance=0.03)
     tangent = np.linspace(2e3, 3.4e4, 33)
     view = np.pi - np.arcsin((6.36e6 + tangent) / 6.76e6)
