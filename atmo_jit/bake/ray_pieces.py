@@ -186,7 +186,7 @@ class Nodes:
 
 
 def sums(values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next, each as exact as it can be."""
+    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next, none from differences."""
     total = np.zeros((len(first) - 1, *values.shape[1:]))
     some = np.flatnonzero(np.diff(first))
     if len(some):
