@@ -2,13 +2,21 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: test slow lint bench ci clean
+.PHONY: test slow client lint bench ci clean
 
 test: .venv/ready
 	$(BIN)/pytest
 
 slow: .venv/ready
 	$(BIN)/pytest -m slow
+
+# A real reader of what `atmo-jit export` writes, drawn in headless Chromium (which has to be installed).
+client: .venv/ready .client/node_modules
+	$(BIN)/pytest -m client
+
+.client/node_modules:
+	npm install --no-save --prefix .client --legacy-peer-deps --ignore-scripts \
+		three@0.180 @takram/three-atmosphere@0.19.1 postprocessing@6.37
 
 lint: .venv/ready
 	$(BIN)/ruff check .
@@ -27,4 +35,4 @@ ci:
 	touch $@
 
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv .client build *.egg-info .pytest_cache .ruff_cache

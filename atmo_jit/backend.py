@@ -6,7 +6,8 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
@@ -93,20 +94,16 @@ def parameter(value: Any) -> Any:
 
 
 def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]:
-    """``count`` consecutive floats starting at ``index * count``, as a list of Floats: packet loads where the count
-    allows."""
+    """``count`` consecutive values of a Float or UInt ``buffer`` from ``index * count`` on, as a list: packet loads
+    where the count is a power of two. Other counts are slow to run, and slower to compile."""
     import drjit as dr
 
     t = types()
+    one, several = (t.UInt, t.ArrayXu) if isinstance(buffer, t.UInt) else (t.Float, t.ArrayXf)
     if count == 1:
-        return [dr.gather(t.Float, buffer, index, active)]
-    values = dr.gather(t.ArrayXf, buffer, index, active, shape=(count, dr.width(index)))
+        return [dr.gather(one, buffer, index, active)]
+    values = dr.gather(several, buffer, index, active, shape=(count, dr.width(index)))
     return [values[i] for i in range(count)]
-
-
-def channels(values: Sequence[Any]) -> list[Any]:
-    """A list of opaque parameters, one per entry."""
-    return [parameter(v) for v in values]
 
 
 def padded(channel_count: int) -> int:
@@ -120,7 +117,7 @@ def row_size(count: int) -> int:
 
 
 def row(buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True) -> list[Any]:
-    """The first ``count`` floats of row ``index`` of a table of rows of ``length`` (default: ``count``)."""
+    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``)."""
     size = row_size(length or count)
     step = min(size, 8)
     parts = [packet(buffer, index * (size // step) + i, step, active) for i in range(-(-count // step))]
@@ -129,7 +126,7 @@ def row(buffer: Any, index: Any, count: int, length: int | None = None, active: 
 
 def table_of(values: Sequence[Any], lane: Any) -> Any:
     """Floats of one width as a table of rows, one per lane, evaluated."""
-    return stored(values, lane, row_size(len(values)))
+    return tables_of([values], lane)[0]
 
 
 class Keeper:
@@ -145,20 +142,90 @@ class Keeper:
 
 
 def table(values: Any) -> Any:
-    """A NumPy array [..., count] as a table of rows."""
+    """A NumPy array [..., count] as a table of rows, of UInts if it is one of integers."""
     values = np.asarray(values)
-    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.float32)
+    whole = values.dtype.kind in "iu"
+    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.uint32 if whole else np.float32)
     rows[..., : values.shape[-1]] = values
-    return floats(rows)
+    return (uints if whole else floats)(rows)
 
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
+    return evaluated(_scattered(values, lane, size))
+
+
+def tables_of(groups: Sequence[Sequence[Any]], lane: Any) -> list[Any]:
+    """Each group of Floats as a table of rows, one per lane, evaluated together: in one kernel."""
+    return evaluated([_scattered(values, lane, row_size(len(values))) for values in groups])
+
+
+def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
     import drjit as dr
 
     t = types()
     out = dr.zeros(t.Float, dr.width(lane) * size)
     padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
     dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
-    dr.eval(out)
     return out
+
+
+def evaluated(buffer: Any) -> Any:
+    """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
+
+    Several Floats in a list are evaluated together, in one kernel if they are of one width.
+
+    Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
+    the process ("dirty variable").
+    """
+    import drjit as dr
+
+    if isinstance(buffer, list):
+        dr.eval(buffer)
+        return [evaluated(one) for one in buffer]
+    if dr.grad_enabled(buffer):
+        return dr.custom(_evaluating(), buffer)
+    dr.eval(buffer)
+    return buffer
+
+
+@contextmanager
+def traversing() -> Iterator[None]:
+    """Derivatives are to be propagated through this package's kernels in such a block.
+
+    Dr.Jit 1.5 aborts the process ("dirty variable") where it sums derivatives into copies of a buffer, one per thread,
+    in a kernel with a loop; here it sums into the buffer itself.
+    """
+    import drjit as dr
+
+    threshold = dr.expand_threshold()
+    dr.set_expand_threshold(0)
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(threshold)
+
+
+@lru_cache(maxsize=1)
+def _evaluating() -> type:
+    import drjit as dr
+
+    class Evaluated(dr.CustomOp):
+        def eval(self, buffer: Any) -> Any:
+            dr.eval(buffer)
+            return buffer
+
+        def forward(self) -> None:
+            grad = self.grad_in("buffer")
+            dr.eval(grad)
+            self.set_grad_out(grad)
+
+        def backward(self) -> None:
+            grad = self.grad_out()
+            dr.eval(grad)
+            self.set_grad_in("buffer", grad)
+
+        def name(self) -> str:
+            return "evaluated"
+
+    return Evaluated

@@ -23,6 +23,8 @@ from .llvm import missing_library
 COMMANDS = {
     "sky": "Radiance, transmittance and irradiance for a list of views.",
     "render": "Render a Mitsuba scene to a linear OpenEXR and a PNG.",
+    "export": "Tables of an atmosphere that other programs load.",
+    "fit": "Fit an atmosphere to measured sky radiance.",
     "plan": "What a scene or views need: what is built or skipped, and its cost.",
     "bench": "Run time against error of every method and peer on this machine.",
     "info": "Versions, the LLVM library in use, the atmospheres that come along.",

@@ -15,12 +15,13 @@ the logarithm of their mean is interpolated linearly in h.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, parameter, types
+from .backend import floats, packet, parameter, row, table_of, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
 from .optics import Optics
@@ -35,10 +36,11 @@ class SunColumns:
     """Table of mean densities over altitude and mu in [0, 1] (logarithmic from the horizontal); bilinear.
 
     ``size`` = (altitudes, cosines), the altitudes shared out among the shells. The cosine nodes are mu = c (e^{s x} -
-    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R).
+    1), fine where the thinnest layer's path length turns from 1/mu to horizontal, mu about sqrt(2 H / R). ``table``:
+    the numbers, where they are known already.
     """
 
-    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128)) -> None:
+    def __init__(self, optics: Optics, size: tuple[int, int] = (96, 128), table: Any = None) -> None:
         self.optics = optics
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
@@ -51,30 +53,38 @@ class SunColumns:
         self._rows = max(4, round(size[0] / self._shells))  # intervals per shell
         edges = np.sqrt(breaks / atmosphere.thickness_m) * _CELLS
         cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
-        self._shell_of_cell = floats(np.clip(cell_start, 0, self._shells - 1))
-        self._bounds = floats(np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.zeros(self._shells)]))
+        # Low, high, 1 / width and number of every shell, and of the shell at the start of every cell.
+        bounds = np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.arange(self._shells)])
+        self._bounds, self._cells = floats(bounds), floats(bounds[np.clip(cell_start, 0, self._shells - 1)])
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
-        self._table = self._build() if self._count else None
-        dr.eval(self._table)
+        self._rule = integration_rule(optics)
+        self.table = table if table is not None else self._build() if self._count else None
+
+    def of(self, optics: Optics) -> SunColumns:
+        """The table for other optics with profiles of the same kind, cut at the same altitudes."""
+        other = copy(self)
+        other.optics = optics
+        other.table = other._build() if self._count else None
+        return other
 
     def _build(self) -> Any:
         t = types()
         rows, cosines = self._rows + 1, self._cosines
         lane = dr.arange(t.UInt, self._shells * rows * cosines)
-        row, column = lane // cosines % rows, lane % cosines
+        place, column = lane // cosines % rows, lane % cosines
         low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
-        x = t.Float(row) / self._rows
+        x = t.Float(place) / self._rows
         # Each end belongs to this shell's side of the break.
         h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
-        totals = column_up(self.optics, h, mu)
+        totals = column_up(self.optics, h, mu, self._rule)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
-        table = dr.zeros(t.Float, dr.width(lane) * self._count)
         at_top = self.optics.densities(h)  # where the path has no length
+        means = []
         for k, total in enumerate(totals):
             mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
-            dr.scatter(table, dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean, lane * self._count + k)
-        return table
+            means.append(dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean)
+        return table_of(means, lane)
 
     def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
         """Column density (m) of every constituent from altitude ``h`` to the top in direction ``mu`` of either sign.
@@ -85,11 +95,11 @@ class SunColumns:
         if not self._count:
             return []
         radius = self.optics.radius
-        mu = dr.maximum(mu, -dr.sqrt(h * (2.0 * radius + h)) / (radius + h))
+        mu = dr.maximum(mu, -dr.safe_sqrt(h * (2.0 * radius + h)) / (radius + h))
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
-        whole = self._rising(lowest, types().Float(0.0), sinks)
+        whole = self._rising(lowest, None, sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
     def upward(self, h: Any) -> list[Any]:
@@ -97,60 +107,68 @@ class SunColumns:
         return self._rising(h, types().Float(1.0), True) if self._count else []
 
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
+        """Columns to the top from ``h`` along mu >= 0; None: horizontally."""
         t = types()
         cosines = self._cosines
-        position = dr.sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
-        shell = t.UInt(dr.gather(t.Float, self._shell_of_cell, dr.minimum(t.UInt(position), _CELLS), active))
-        _, high, _, _ = packet(self._bounds, shell, 4, active)
-        shell = dr.select((h >= high) & (shell + 1 < self._shells), shell + 1, shell)
-        low, high, per_width, _ = packet(self._bounds, shell, 4, active)
+        position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
+        _, high, _, shell = packet(self._cells, dr.minimum(t.UInt(position), _CELLS), 4, active)
+        shell = t.UInt(dr.minimum(dr.select(h >= high, shell + 1.0, shell), self._shells - 1.0))
+        _, high, per_width, _ = packet(self._bounds, shell, 4, active)
         depth = dr.clip((high - h) * per_width, 0.0, 1.0)
-        y = dr.sqrt(depth) * self._rows
-        row = dr.minimum(t.UInt(y), self._rows - 1)
-        start = t.Float(row)
+        y = dr.safe_sqrt(depth) * self._rows
+        below = dr.minimum(t.UInt(y), self._rows - 1)
+        start = t.Float(below)
         by_root = y - start
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
-        x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
-        column = dr.minimum(t.UInt(x), cosines - 2)
-        fx = x - t.Float(column)
-        corner = dr.fma(shell, self._rows + 1, row) * cosines + column
-        n = self._count
-        a, b, c, d = (packet(self._table, corner + offset, n, active) for offset in (0, 1, cosines, cosines + 1))
-        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
+        corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
+        if mu is None:
+            near, far = (row(self.table, corner + offset, n, active=active) for offset in (0, cosines))
+        else:
+            x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
+            column = dr.minimum(t.UInt(x), cosines - 2)
+            fx = x - t.Float(column)
+            a, b, c, d = (
+                row(self.table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
+            )
+            near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
+        path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)
         result = []
         for k in range(n):
-            fy = by_altitude if self._logarithmic[k] else by_root
-            mean = dr.lerp(dr.lerp(a[k], b[k], fx), dr.lerp(c[k], d[k], fx), fy)
+            mean = dr.lerp(near[k], far[k], by_altitude if self._logarithmic[k] else by_root)
             result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
         return result
 
 
 def sun_columns(optics: Optics, grid: Grid) -> SunColumns:
     """The table for an atmosphere, kept with the grid unless the profiles carry derivatives."""
-    if optics.profiles_differentiable:
-        return SunColumns(optics, grid.resolution.columns)
-    return grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    with dr.suspend_grad():
+        columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    return columns.of(optics) if optics.profiles_differentiable else columns
 
 
-def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:
+def integration_rule(optics: Optics) -> tuple[Any, Any]:
+    """What column_up integrates by: the altitudes between which profiles are smooth; nodes and weights in between."""
+    return floats(optics.breaks_m), floats(np.column_stack(gauss_legendre(NODES_PER_LAYER)))
+
+
+def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = None) -> list[Any]:
     """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the
-    profile's breaks."""
-    t = types()
-    breaks = floats(optics.breaks_m)
-    x, w = gauss_legendre(NODES_PER_LAYER)
+    profile's breaks. ``rule``: see integration_rule."""
+    t, count = types(), NODES_PER_LAYER
+    breaks, nodes = rule or integration_rule(optics)
 
-    def layer(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:
-        low = dr.maximum(dr.gather(t.Float, breaks, index), h)
-        high = dr.maximum(dr.gather(t.Float, breaks, index + 1), h)
+    # One node per pass, not one layer: a quarter of the code to compile.
+    def add(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:
+        low, high = (dr.maximum(dr.gather(t.Float, breaks, index // count + i), h) for i in (0, 1))
+        node, weight = packet(nodes, index % count, 2)
         start = distance_up(optics.radius, h, mu, low)
         length = distance_up(optics.radius, h, mu, high) - start
-        for node, weight in zip(x, w, strict=True):
-            there, _ = altitude_along(optics.radius, h, mu, dr.fma(length, float(node), start))
-            for k, density in enumerate(optics.densities(there)):
-                totals[k] = dr.fma(length * float(weight), density, totals[k])
-        return index + 1, totals
+        there, _ = altitude_along(optics.radius, h, mu, dr.fma(length, node, start))
+        length = length * weight
+        densities = optics.densities(there)
+        return index + 1, [dr.fma(length, d, total) for d, total in zip(densities, totals, strict=True)]
 
-    last = dr.opaque(t.UInt, len(optics.breaks_m) - 1, 1)
+    last = dr.opaque(t.UInt, count * (len(optics.breaks_m) - 1), 1)
     zero = [dr.zeros(t.Float, dr.width(h)) for _ in optics.constituents]
-    _, totals = dr.while_loop((t.UInt(0), zero), lambda i, _: i < last, layer, max_iterations=-1, label="column_up")
+    _, totals = dr.while_loop((t.UInt(0), zero), lambda i, _: i < last, add, max_iterations=-1, label="column_up")
     return totals

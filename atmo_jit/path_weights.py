@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
-from .backend import row, table_of, types
+from .backend import row, table, table_of, tables_of, types
 from .optics import Optics
 from .paths import Paths, Points, points_along
+from .quadrature import gauss_legendre, running_integral
 
 
 @dataclass
@@ -28,18 +30,32 @@ class Columns:
 
 def columns_along(optics: Optics, points: Points) -> Columns:
     """Densities and columns at the points of the paths, kept with them unless the profiles carry derivatives."""
+    if not optics.constituents or not len(points.h):
+        empty = dr.zeros(types().Float, 8)
+        return Columns(empty, empty, empty)
     if optics.profiles_differentiable:
-        return _columns_along(optics, points)
-    return points.paths.kept(("columns", points.nodes), lambda: _columns_along(optics, points))
+        return _traced_columns(optics, points)
+    return points.paths.kept(("columns", points.nodes), lambda: _columns(optics, points))
 
 
-def _columns_along(optics: Optics, points: Points) -> Columns:
+def _columns(optics: Optics, points: Points) -> Columns:
+    """In NumPy: it is done once, and compiling kernels for it would take longer than all of it."""
+    kinds, nodes = len(optics.constituents), points.nodes
+    density = np.stack([np.asarray(c.profile.density(points.h)) for c in optics.constituents], axis=-1)
+    in_part = density.reshape(-1, nodes, kinds)
+    own = np.einsum("pg,pgk->pk", points.weight.reshape(-1, nodes), in_part)
+    before = np.concatenate([np.zeros((1, kinds)), np.cumsum(own, axis=0)])
+    per_ray = points.first_part[points.paths.first]
+    inside = np.einsum("gi,pik->pgk", running_integral(nodes, tuple(gauss_legendre(nodes)[0].tolist())), in_part)
+    passed = (before[:-1] - before[per_ray[points.part_ray]])[:, None] + points.length.reshape(-1, nodes, 1) * inside
+    return Columns(table(density), table(passed.reshape(-1, kinds)), table(before[per_ray[1:]] - before[per_ray[:-1]]))
+
+
+def _traced_columns(optics: Optics, points: Points) -> Columns:
+    """The same with derivatives by the profiles' parameters."""
     t, d, nodes = types(), points.device, points.nodes
     kinds = len(optics.constituents)
     count = len(points.h)
-    if not kinds or not count:
-        empty = dr.zeros(t.Float, 8)
-        return Columns(empty, empty, empty)
     lane = dr.arange(t.UInt, count)
     density = table_of(optics.densities(d.h), lane)
     part = dr.arange(t.UInt, count // nodes)
@@ -83,16 +99,15 @@ class PathWeights:
         at, device, d = columns_along(optics, points), paths.device, points.device
         kinds, channels = len(optics.constituents), optics.channel_count
         visit = dr.arange(t.UInt, len(paths.station))
-        station = device.station
         sharing = points.shares.shape[1]
-        bounds = [dr.gather(t.UInt, d.bounds, station * (sharing + 1) + i) for i in range(sharing + 1)]
+        bounds = row(d.bounds, device.station, sharing + 1)
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             # The farther along the path a point lies, the farther behind it this station is.
             place = t.UInt(sharing - 1)
             for bound in bounds[1:-1]:
                 place = dr.select(i >= bound, place - 1, place)
-            weight = dr.gather(t.Float, d.weight, i) * dr.gather(t.Float, d.shares, i * sharing + place)
+            weight = dr.gather(t.Float, d.shares, i * sharing + place)
             density, column = row(at.density, i, kinds), row(at.column, i, kinds)
             seen = [dr.exp(-depth) * weight for depth in optics.optical_depths(column)]
             return i + 1, [
@@ -102,18 +117,15 @@ class PathWeights:
             ]
 
         sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
-        self.scattered = dr.zeros(t.Float, 8)
         if sums:
             state, end = (bounds[0] + 0, sums), bounds[-1]
             _, sums = dr.while_loop(state, lambda i, _: i < end, add, max_iterations=-1, label="weights")
-            self.scattered = table_of([s * device.factor for s in sums], visit)
         depths = [0.0] * channels
         if kinds:
             depths = optics.optical_depths(row(at.whole, device.ray, kinds))
-        self.reflected = table_of(
-            [
-                dr.exp(-t.Float(depth)) * device.on_ground * albedo * dr.inv_pi
-                for depth, albedo in zip(depths, optics.albedo, strict=True)
-            ],
-            visit,
-        )
+        reflected = [
+            dr.exp(-t.Float(depth)) * device.on_ground * albedo * dr.inv_pi
+            for depth, albedo in zip(depths, optics.albedo, strict=True)
+        ]
+        scattered = [s * device.factor for s in sums] or [t.Float(0.0)]
+        self.scattered, self.reflected = tables_of([scattered, reflected], visit)

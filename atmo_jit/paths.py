@@ -243,9 +243,10 @@ class Points:
 
     @cached_property
     def device(self) -> SimpleNamespace:
-        """What kernels read: per point ``h``, ``length``, ``weight``, ``shares``; per part ``first`` (first part of its
-        ray); per station ``bounds`` [T, shares + 1]: where the points begin for which it is the last of the stations
-        that share, the last but one, ..., and where they end; per ray ``ray_parts`` [N, 2]; ``running`` integrals."""
+        """What kernels read: per point ``h``, ``length``, ``weight``, and ``shares`` times weight; per part ``first``
+        (first part of its ray); per station ``bounds``, table [T, shares + 1]: where the points begin for which it is
+        the last of the stations that share, the last but one, ..., and where they end; per ray ``ray_parts`` [N, 2];
+        ``running`` integrals."""
         paths = self.paths
         per_ray, reach = self.first_part[paths.first], self.shares.shape[1] // 2
         station = np.arange(paths.count)[:, None] + np.arange(-reach, reach + 1)
@@ -254,9 +255,9 @@ class Points:
             h=floats(self.h),
             length=floats(self.length),
             weight=floats(self.weight),
-            shares=floats(self.shares),
+            shares=floats(self.weight[:, None] * self.shares),
             first=uints(per_ray[self.part_ray]),
-            bounds=uints(self.nodes * self.first_part[within]),
+            bounds=table(self.nodes * self.first_part[within]),
             ray_parts=uints(np.column_stack([per_ray[:-1], per_ray[1:]])),
             running=table(running_integral(self.nodes, tuple(gauss_legendre(self.nodes)[0].tolist()))),
         )

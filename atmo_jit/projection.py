@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, stored, types, uints
+from .backend import floats, packet, padded, row_size, stored, table_of, types, uints
 from .grid import Grid
 from .harmonics import legendre, pair_count, pairs
 from .paths import Directions
@@ -27,14 +27,15 @@ def add_harmonics(sums: list[Any], values: list[Any], cos_phi: Any) -> list[Any]
     return new
 
 
-def stored_harmonics(sums: list[Any], azimuths: int) -> Any:
-    """Sums [m x channel] over ``azimuths`` of the half circle, one lane per ray and sun, as azimuthal harmonics [m,
-    channel, rays, suns], evaluated."""
-    t = types()
+def stored_harmonics(sums: list[Any], channels: int, azimuths: int) -> Any:
+    """Sums [m x channel] over ``azimuths`` of the half circle, one lane per ray and sun, as azimuthal harmonics: table
+    [rays, suns, m x padded channels], evaluated."""
+    t, size = types(), padded(channels)
     share = dr.opaque(t.Float, 2.0 * np.pi / azimuths, 1)
-    out = dr.ravel(t.ArrayXf([share * s for s in sums]), order="C")
-    dr.eval(out)
-    return out
+    values: list[Any] = []
+    for first in range(0, len(sums), channels):
+        values += [share * s for s in sums[first : first + channels]] + [t.Float(0.0)] * (size - channels)
+    return table_of(values, dr.arange(t.UInt, dr.width(sums)))
 
 
 def room(suns: int) -> int:
@@ -90,22 +91,27 @@ class Projection:
         return grid.kept(("projection", directions, degree, most), lambda: cls(directions, degree, most))
 
     def __call__(self, harmonics: Any, suns: int, channels: int) -> Moments:
-        """``harmonics`` [m, channel, K, D, room(suns)] -> moments and irradiance."""
-        t, entries, count = types(), self.entries, self.count
-        blocks, per_harmonic = room(suns) // TOGETHER, self.altitudes * count * room(suns) // TOGETHER
-        lane = dr.arange(t.UInt, self.altitudes * entries * blocks)
-        block, rest = lane % blocks, lane // blocks
-        entry, k = rest % entries, rest // entries
-        first = dr.gather(t.UInt, self._m, entry) * (channels * per_harmonic) + k * (count * blocks) + block
+        """``harmonics`` [K, D, room(suns), m x padded channels] -> moments and irradiance."""
+        t, entries, count, size = types(), self.entries, self.count, padded(channels)
+        lane = dr.arange(t.UInt, self.altitudes * entries * (room(suns) // TOGETHER))
+        # Sizes are read from memory: one kernel for all of them.
+        entries, blocks, per_sun, count = (
+            dr.opaque(t.UInt, v, 1)
+            for v in (entries, room(suns) // TOGETHER, row_size((self.most + 1) * size) // size, count)
+        )
+        rest = lane // blocks
+        k = rest // entries
+        block, entry = lane - rest * blocks, rest - k * entries
+        first = (k * (count * blocks) + block) * (TOGETHER * per_sun) + dr.gather(t.UInt, self._m, entry)
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             weight = dr.gather(t.Float, self._basis, rest * count + i)
-            values = [packet(harmonics, first + i * blocks + c * per_harmonic, TOGETHER) for c in range(channels)]
+            place = first + i * (blocks * TOGETHER * per_sun)
+            values = [packet(harmonics, place + s * per_sun, size) for s in range(TOGETHER)]
             return i + 1, [
-                dr.fma(weight, values[c][s], sums[s * channels + c]) for s in range(TOGETHER) for c in range(channels)
+                dr.fma(weight, values[s][c], sums[s * channels + c]) for s in range(TOGETHER) for c in range(channels)
             ]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(TOGETHER * channels)]
-        end = dr.opaque(t.UInt, count, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, max_iterations=-1, label="directions")
+        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < count, add, max_iterations=-1, label="directions")
         return Moments(stored(sums, lane, len(sums)), self.degree, self.most, suns, channels)

@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-from .backend import packet, stored, types
+from .backend import packet, row, row_size, stored, types
 from .grid import Grid, cubic
 from .projection import Moments
 
@@ -19,9 +19,8 @@ STEEPEST = 1.2  # e-folds of the reference from one solved sun to the next
 
 
 class Reference:
-    """``log`` [K, first suns, channels] of the reference, ``inverse`` = exp(-log), and ``fine`` [K, suns, 4]: the
-    reference at so many suns that it is linear between them. It guides only: it carries no derivative.
-
+    """``log`` of the reference, ``inverse`` = exp(-log), tables [K, first suns, channels], and ``fine`` [K, suns, 4]:
+    the reference at so many suns that it is linear between them. It guides only: it carries no derivative.
     """
 
     def __init__(self, grid: Grid, channels: int) -> None:
@@ -49,36 +48,34 @@ class Reference:
     def _make(self, light: Moments) -> None:
         t, grid, channels = types(), self.grid, light.channels
         altitudes, suns = grid.shape[0], len(grid.first_theta)
-        lane = dr.arange(t.UInt, altitudes * suns * channels)
+        values, steepest = dr.detach(light.values), dr.opaque(t.Float, STEEPEST / grid.first, 1)
+        lane, end = dr.arange(t.UInt, altitudes * suns * channels), dr.opaque(t.UInt, suns, 1)
         channel, node = lane % channels, lane // channels
-        zeroth = dr.gather(t.Float, dr.detach(light.values), light.index(node // suns, 0, node % suns, channel))
-        logs = dr.log(dr.maximum(zeroth, 1e-30))
-        dr.eval(logs)
+        sun, k = node % suns, node // suns
+
         # In the planet's shadow order 1 vanishes and later orders do not: their quotient must stay moderate.
-        sun, first = t.Float(node % suns), lane - node % suns * channels
-        steepest = dr.opaque(t.Float, STEEPEST / grid.first, 1)
-
         def steady(i: Any, highest: Any) -> tuple[Any, Any]:
-            there = dr.gather(t.Float, logs, first + i * channels) - steepest * dr.abs(sun - t.Float(i))
-            return i + 1, dr.maximum(highest, there)
+            zeroth = dr.gather(t.Float, values, light.index(k, 0, i, channel))
+            fall = steepest * dr.abs(t.Float(sun) - t.Float(i))
+            return i + 1, dr.maximum(highest, dr.log(dr.maximum(zeroth, 1e-30)) - fall)
 
-        end = dr.opaque(t.UInt, suns, 1)
-        _, self.log = dr.while_loop((t.UInt(0), logs), lambda i, _: i < end, steady, label="steady")
-        self.inverse = dr.exp(-self.log)
+        lowest = dr.full(t.Float, -100.0, dr.width(lane))
+        _, highest = dr.while_loop((t.UInt(0), lowest), lambda i, _: i < end, steady, label="steady")
+        self.log, self.inverse = (dr.zeros(t.Float, altitudes * suns * row_size(channels)) for _ in range(2))
+        place = node * row_size(channels) + channel
+        dr.scatter(self.log, highest, place)
+        dr.scatter(self.inverse, dr.exp(-highest), place)
         dr.eval(self.log, self.inverse)
         fine = FINE * (grid.shape[1] - 1) + 1
         lane = dr.arange(t.UInt, altitudes * fine)
         source, k = lane % fine, lane // fine
         taps = Taps(grid, t.Float(source) * (grid.first / FINE), suns)
-        values = [
-            dr.exp(taps.sum([dr.gather(t.Float, self.log, (k * suns + at) * channels + c) for at in taps.at]))
-            for c in range(channels)
-        ]
-        self.fine = stored(values, lane, 4)
+        rows = [row(self.log, k * suns + at, channels) for at in taps.at]
+        self.fine = stored([dr.exp(taps.sum([r[c] for r in rows])) for c in range(channels)], lane, 4)
 
     def index(self, k: Any, sun: Any, channel: Any) -> Any:
         """Place of ``inverse`` at an altitude node and a solved sun."""
-        return (k * len(self.grid.first_theta) + sun * self.grid.first) * self.channels + channel
+        return (k * len(self.grid.first_theta) + sun * self.grid.first) * row_size(self.channels) + channel
 
     def at(self, level: Any, x: Any, active: Any = True, fine: Any = None) -> list[Any]:
         """The reference at a level and a sun coordinate, per channel; ``fine``: at other levels than the grid's."""

@@ -7,13 +7,17 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, row, row_size, table_of, types, uints
+from .backend import evaluated, floats, row_size, table_of, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pair_index, pairs
 from .optics import Optics
 from .projection import Moments
 from .refinement import Reference, Taps
+
+# Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
+# derivative of a quotient, which has a square below the line, must not leave single precision.
+DARK = 1e-16
 
 
 def total_of(
@@ -30,140 +34,127 @@ def total_of(
     ``shares``, per later order: what it counts [S, channels] in the light that scatters or reflects once more, and in
     the light that arrives.
     """
-    counted, arriving = ([pair[i] for pair in shares] for i in (0, 1))
-    entries = pair_count(first.degree)
+    t, channels, entries, few = types(), first.channels, pair_count(first.degree), grid.shape[1]
     per_depth = _per_depth(optics, columns, grid)
-    peaks = [
-        _peak(optics, grid, first, order, n) if order.entries < first.entries else None
-        for n, order in enumerate(rest, 1)
-    ]
-    return (
-        _sum(grid, reference, first, rest, counted, 0, entries, peaks),
-        _over(grid, _sum(grid, reference, first, rest, arriving, entries, 1), per_depth, first.channels),
-        _over(grid, _sum(grid, reference, first, rest, counted, entries, 1), per_depth, first.channels),
-    )
-
-
-def _sum(
-    grid: Grid,
-    reference: Reference,
-    first: Moments,
-    rest: list[Moments],
-    shares: list[Any],
-    start: int,
-    entries: int,
-    peaks: list[Any] | None = None,
-) -> Any:
-    """Quotients [K, first suns, entries, channels] over the reference of the weighed sum of orders, from entry
-    ``start`` of order 1 on."""
-    t, channels = types(), first.channels
-    suns, few = len(grid.first_theta), grid.shape[1]
-    lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
+    # After the moments the irradiance twice: what may be reflected, and what arrives.
+    suns, width = len(grid.first_theta), entries + 2
+    lane = dr.arange(t.UInt, grid.shape[0] * suns * width * channels)
     channel, place = lane % channels, lane // channels
-    entry, node = place % entries, place // entries
+    entry, node = place % width, place // width
     sun, k = node % suns, node // suns
-    total = dr.gather(t.Float, first.values, first.index(k, start + entry, sun, channel))
-    total = total * dr.gather(t.Float, reference.inverse, node * channels + channel)
+    total = dr.gather(t.Float, first.values, first.index(k, dr.minimum(entry, entries), sun, channel))
+    total = total * dr.gather(t.Float, reference.inverse, node * row_size(channels) + channel)
     if rest:
-        later = _rest(grid, reference, first, rest, shares, start, entries, peaks)
+        later = _rest(optics, grid, reference, first, rest, shares)
         taps = Taps(grid, t.Float(sun) / grid.first, few)
-        values = [dr.gather(t.Float, later, ((k * few + at) * entries + entry) * channels + channel) for at in taps.at]
-        total = total + taps.sum(values, dr.gather(t.Float, parity(grid, first.degree), start + entry))
-    dr.eval(total)
-    return total
+        values = [dr.gather(t.Float, later, ((k * few + at) * width + entry) * channels + channel) for at in taps.at]
+        total = total + taps.sum(values, dr.gather(t.Float, parity(grid, first.degree), dr.minimum(entry, entries)))
+    moments = dr.zeros(t.Float, grid.shape[0] * suns * entries * channels)
+    reflected, sky = (dr.zeros(t.Float, grid.shape[0] * suns * channels) for _ in range(2))
+    dr.scatter(moments, total, (node * entries + entry) * channels + channel, entry < entries)
+    dr.scatter(reflected, total, node * channels + channel, entry == entries)
+    dr.scatter(sky, total, node * channels + channel, entry == entries + 1)
+    moments, reflected, sky = evaluated([moments, reflected, sky])
+    return moments, _over(grid, sky, per_depth, channels), _over(grid, reflected, per_depth, channels)
 
 
 def _rest(
+    optics: Optics,
     grid: Grid,
     reference: Reference,
     first: Moments,
     rest: list[Moments],
-    shares: list[Any],
-    start: int,
-    entries: int,
-    peaks: list[Any] | None,
+    shares: list[tuple[Any, Any]],
 ) -> Any:
-    """The same of the later orders, at their suns [K, S, entries, channels]."""
-    t, channels, suns = types(), rest[0].channels, grid.shape[1]
-    lane = dr.arange(t.UInt, grid.shape[0] * suns * entries * channels)
-    channel, place = lane % channels, lane // channels
-    entry, node = place % entries, place // entries
-    sun, k = node % suns, node // suns
-    total = 0.0
-    sharp = None
-    if peaks and any(peak is not None for peak in peaks):
-        sharp = dr.gather(t.Float, first.values, first.index(k, entry, sun * grid.first, channel))
-    for order, share, peak in zip(rest, shares, peaks or [None] * len(rest), strict=True):
-        there = dr.gather(t.UInt, _places(grid, first, order), start + entry)
-        held = there > 0
-        index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
-        weight = dr.gather(t.Float, share, sun * channels + channel)
-        value = dr.gather(t.Float, order.values, index, held)
-        if peak is not None:
-            size, fading = peak
-            l_ = dr.minimum(dr.gather(t.UInt, _degrees(grid, first.degree), entry), order.degree)
-            more = dr.gather(t.Float, size, ((l_ * grid.shape[0] + k) * suns + sun) * channels + channel)
-            value = dr.select(held, value, sharp * more * dr.gather(t.Float, fading, entry * channels + channel))
-        total = dr.fma(value, weight, total)
-    total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    dr.eval(total)
-    return total
+    """Quotients [K, S, moments and two irradiances, channels] over the reference of the weighed sum of the later
+    orders, at their suns.
 
-
-def _peak(optics: Optics, grid: Grid, first: Moments, order: Moments, events: int) -> tuple[Any, Any]:
-    """Forward peak of an order beyond the moments that it has, as a part of order 1: (size [l, K, S, channels], fading
-    [entries, channels]).
-
-    Light in a forward peak goes nearly straight on, and every further event multiplies its moments of degree l by one
-    factor that does not depend on l, and by chi_l. So with n ``events`` more than order 1 has, and known moments up to
-    degree L and azimuthal order M,
+    An order's forward peak beyond the moments that it has is taken from order 1. Light in a forward peak goes nearly
+    straight on, and every further event multiplies its moments of degree l by one factor that does not depend on l, and
+    by chi_l. So with n events more than order 1 has, and known moments up to degree L and azimuthal order M,
 
         L_lm = L_lm(order 1) r_l                          for l <= L, m > M,
         L_lm = L_lm(order 1) r_L (chi_l / chi_L)^n        for l > L,
 
     where r_l is how order and order 1 compare at degree l, m >= 1: m = 0 has the horizon in it.
     """
-    t, channels, kinds, (altitudes, suns) = types(), first.channels, len(optics.scatterers), grid.shape
+    t, channels, entries, (altitudes, suns) = types(), first.channels, pair_count(first.degree), grid.shape
+    lane = dr.arange(t.UInt, altitudes * suns * (entries + 2) * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % (entries + 2), place // (entries + 2)
+    sun, k = node % suns, node // suns
+    arrives, entry = entry > entries, dr.minimum(entry, entries)
+    sharp = None
+    fading: dict[int, Any] = {}
+    total = 0.0
+    for events, (order, (counted, arriving)) in enumerate(zip(rest, shares, strict=True), 1):
+        there = dr.gather(t.UInt, _places(grid, first, order), entry)
+        held = there > 0
+        index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
+        weight = dr.select(
+            arrives, *(dr.gather(t.Float, share, sun * channels + channel) for share in (arriving, counted))
+        )
+        value = dr.gather(t.Float, order.values, index, held)
+        if order.entries < first.entries:
+            l_ = dr.gather(t.UInt, _degrees(grid, first.degree), entry)
+            if sharp is None:
+                sharp = dr.gather(t.Float, first.values, first.index(k, entry, sun * grid.first, channel))
+            if order.degree not in fading:
+                fading[order.degree] = _fading(optics, l_, order.degree, first.degree, channel)
+            size = ((dr.minimum(l_, order.degree) * altitudes + k) * suns + sun) * channels + channel
+            peak = sharp * dr.gather(t.Float, _peak(grid, reference, first, order), size)
+            for _ in range(events):
+                peak = peak * fading[order.degree]
+            value = dr.select(held, value, peak)
+        total = dr.fma(value, weight, total)
+    total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+    return evaluated(total)
+
+
+def _fading(optics: Optics, l_: Any, degree: int, highest: int, channel: Any) -> Any:
+    """chi_l / chi_L of the ``channel`` for l above L = ``degree``, 1 below. Beyond degree 2 only aerosols scatter; of
+    several, the sharpest keeps its peak longest."""
+    t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
+    moments, length = optics.phase_moments(highest + 1), row_size(kinds * channels)
+    chi = []
+    for at in (l_, dr.minimum(l_, degree)):
+        of_kinds = [dr.gather(t.Float, moments, at * length + n * channels + channel) for n in range(kinds)]
+        largest = of_kinds[0]
+        for value in of_kinds[1:]:
+            largest = dr.maximum(largest, value)
+        chi.append(largest)
+    high, low = chi
+    return dr.select(low > 0.0, dr.clip(high / dr.select(low > 0.0, low, 1.0), 0.0, 1.0), 0.0)
+
+
+def _peak(grid: Grid, reference: Reference, first: Moments, order: Moments) -> Any:
+    """r_l of an order's forward peak, [l, K, S, channels]."""
+    t, channels, (altitudes, suns) = types(), first.channels, grid.shape
     lane = dr.arange(t.UInt, (order.degree + 1) * altitudes * suns * channels)
     channel, node = lane % channels, lane // channels
     sun, node = node % suns, node // suns
+    sun = dr.maximum(sun, int(grid.whole_suns))  # under the zenith light has m = 0 alone: the next sun's ratio holds
     k, l_ = node % altitudes, node // altitudes
     product, square = 0.0, 0.0
+    scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
     for m in range(min(order.most, 1), order.most + 1):
         held = l_ >= m
         # Places of (l, m) are consecutive in l.
         a, b = (
-            dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
+            scale * dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
             for light, there, start in (
                 (first, sun * grid.first, pair_index(first.degree, m, m)),
                 (order, sun, pair_index(order.degree, m, m)),
             )
         )
         product, square = dr.fma(a, b, product), dr.fma(a, a, square)
-    size = dr.select(square > 0.0, dr.maximum(product, 0.0) / dr.select(square > 0.0, square, 1.0), 0.0)
-
-    l_ = _degrees(grid, first.degree)
-    moments = optics.phase_moments(first.degree + 1)
-    there, last = (row(moments, at, kinds * channels) for at in (l_, dr.minimum(l_, order.degree)))
-    values = []
-    for c in range(channels):
-        # Beyond degree 2 only aerosols scatter; of several, the sharpest keeps its peak longest.
-        high, low = there[c], last[c]
-        for n in range(1, kinds):
-            high, low = dr.maximum(high, there[n * channels + c]), dr.maximum(low, last[n * channels + c])
-        quotient = dr.select(low > 0.0, dr.clip(high / dr.select(low > 0.0, low, 1.0), 0.0, 1.0), 0.0)
-        power = quotient
-        for _ in range(events - 1):
-            power = power * quotient
-        values.append(power)
-    fading = dr.ravel(t.ArrayXf(values), order="F")
-    dr.eval(size, fading)
-    return size, fading
+    lit = square > DARK
+    return evaluated(dr.select(lit, dr.maximum(product, 0.0) / dr.select(lit, square, 1.0), 0.0))
 
 
 def _degrees(grid: Grid, degree: int) -> Any:
-    """l of every pair."""
-    return grid.kept(("degrees", degree), lambda: uints(pairs(degree)[0]))
+    """l of every pair, and 0 for the irradiance."""
+    return grid.kept(("degrees", degree), lambda: uints(np.append(pairs(degree)[0], 0)))
 
 
 def _places(grid: Grid, light: Moments, lower: Moments) -> Any:
@@ -198,12 +189,14 @@ def _over(grid: Grid, irradiance: Any, per_depth: Any, channels: int) -> Any:
     t = types()
     altitudes, width = grid.shape[0], len(grid.first_theta) * channels
     lane = dr.arange(t.UInt, altitudes * width)
-    quotient = irradiance * dr.gather(t.Float, per_depth, lane // width * row_size(channels) + lane % channels)
-    dr.eval(quotient)
+
+    def over(level: Any) -> Any:
+        column = lane % width
+        depth = dr.gather(t.Float, per_depth, level * row_size(channels) + column % channels)
+        return dr.gather(t.Float, irradiance, level * width + column) * depth
+
     # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
-    end = altitudes * width - width + lane % width
-    near, far = (dr.maximum(dr.gather(t.Float, quotient, end - n * width), 1e-30) for n in (1, 2))
+    level = lane // width
+    near, far = (dr.maximum(over(dr.opaque(t.UInt, altitudes - 1 - n, 1)), 1e-30) for n in (1, 2))
     steady = near * dr.clip(near / far, 0.25, 4.0)
-    quotient = dr.select(lane >= (altitudes - 1) * width, steady, quotient)
-    dr.eval(quotient)
-    return quotient
+    return evaluated(dr.select(level >= altitudes - 1, steady, over(level)))

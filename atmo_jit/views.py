@@ -133,3 +133,18 @@ def _in_range(values: np.ndarray, name: str, where: str) -> np.ndarray:
         index = int(np.argmin(inside))
         raise InputError(f"{where}: {name}[{index}] is {float(values[index])!r}; allowed are {allowed.text}")
     return np.clip(values, allowed.low, allowed.high) + 0.0  # + 0.0: a fresh array, and -0 becomes 0
+
+
+def side_by_side(radius_m: float, thickness_m: float, altitude_m: np.ndarray, view_zenith: np.ndarray) -> np.ndarray:
+    """Order [N] in which rays with paths of a kind are neighbours: those that end on the ground, those that pass their
+    perigee, and those that rise, each by its lowest or highest altitude.
+
+    A vector of the processor marches eight rays or more and is done when the last of them is; in random order that
+    takes twice as long. ``view_zenith`` in radians.
+    """
+    r = radius_m + altitude_m
+    falls = view_zenith > 0.5 * np.pi
+    perigee = r * np.sin(view_zenith) - radius_m
+    within = np.clip(altitude_m, 0.0, thickness_m) / thickness_m
+    key = np.where(falls, np.where(perigee <= 0.0, within, 2.0 + perigee / thickness_m), -1.0 - within)
+    return np.argsort(key, kind="stable")

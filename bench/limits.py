@@ -3,7 +3,8 @@
 Two bare loops give the limits: a march step (one square root, two exponentials, nothing read) and gathers of four
 neighbouring floats at random places of a table of 256 KiB. A stage is a compiled kernel, named by the loops in it. Its
 own work is counted, not estimated: how often each loop runs (by a counter in the loop), and how many arithmetic
-instructions and gathers one pass through it has (in the compiler's intermediate code). The ratio
+instructions and gathers one pass through it has (in the compiler's intermediate code); what is outside loops counts
+once for every lane. The ratio
 
     seconds / (instructions / rate of the march step + gathers / rate of gathers)
 
@@ -27,6 +28,7 @@ LANES, STEPS = 1 << 17, 256
 RUNS = 5
 TABLE = 1 << 14  # packets of four floats: 256 KiB
 _LOOP = re.compile(r"; Symbolic loop: (\S+)")
+OUTSIDE = ""
 _LABEL = re.compile(r"^l_(\d+)_(\w+):")
 _GATHER = re.compile(r"call .*(@llvm\.masked\.gather|@gather_\d+x)")
 
@@ -115,7 +117,18 @@ def _best(work: Callable[[], Any]) -> dict[str, float]:
 def loops_of(code: str) -> dict[str, tuple[int, int, int]]:
     """Of every loop in a kernel's intermediate code, by its label: (1, arithmetic instructions, gathers) of one pass,
     what is in loops inside it not counted."""
-    found: dict[str, list[int]] = {}
+    found = _counted(code)
+    del found[OUTSIDE]
+    return found
+
+
+def outside_loops(code: str) -> tuple[int, int]:
+    """Arithmetic instructions and gathers of a kernel that every lane runs once."""
+    return _counted(code)[OUTSIDE][1:]
+
+
+def _counted(code: str) -> dict[str, tuple[int, int, int]]:
+    found: dict[str, list[int]] = {OUTSIDE: [1, 0, 0]}
     open_loops: list[tuple[str, str]] = []  # number of the block, label of the loop
     number = ""
     for line in code.splitlines():
@@ -128,9 +141,9 @@ def loops_of(code: str) -> dict[str, tuple[int, int, int]]:
             open_loops.append((number, loop[1]))
             found.setdefault(loop[1], [0, 0, 0])[0] += 1
         elif text.startswith(("define internal", "attributes", "}")):
-            open_loops.clear()
-        elif open_loops and " = " in text:
-            counts = found[open_loops[-1][1]]
+            break  # the kernel ends; what it calls follows
+        elif " = " in text:
+            counts = found[open_loops[-1][1] if open_loops else OUTSIDE]
             if _GATHER.search(text):
                 counts[2] += 1
             elif " phi " not in text and "getelementptr" not in text and "extractvalue" not in text:
@@ -172,7 +185,7 @@ def counted_loops() -> Iterator[dict[str, int]]:
 
 
 def stages(work: Callable[[], Any], limits: dict[str, float]) -> list[dict[str, Any]]:
-    """A row per kernel of ``work`` that has a loop, longest first, kernels of the same loops together.
+    """A row per kernel of ``work``, longest first, kernels of the same loops (or of none) together.
 
     ``work`` is called once to compile, RUNS times to be timed (the least counts) and once with counters.
     """
@@ -190,11 +203,14 @@ def _stages(work: Callable[[], Any], limits: dict[str, float]) -> list[dict[str,
             work()
         spent_now: dict[tuple[str, ...], float] = defaultdict(float)
         launches: dict[tuple[str, ...], int] = defaultdict(int)
+        once: dict[tuple[str, ...], np.ndarray] = defaultdict(lambda: np.zeros(2))
         per_pass: dict[str, tuple[float, float]] = {}
         for kernel in kernels:
-            loops = loops_of(kernel["ir"].getvalue())
+            code = kernel["ir"].getvalue()
+            loops = loops_of(code)
             spent_now[tuple(loops)] += 1e-3 * kernel["execution_time"]
             launches[tuple(loops)] += 1
+            once[tuple(loops)] += kernel["size"] * np.array(outside_loops(code), dtype=float)
             for label, (times, instructions, gathers) in loops.items():
                 per_pass[label] = (instructions / times, gathers / times)
         seconds = {labels: min(spent, seconds.get(labels, spent)) for labels, spent in spent_now.items()}
@@ -209,9 +225,10 @@ def _stages(work: Callable[[], Any], limits: dict[str, float]) -> list[dict[str,
         }
         # A loop of one name that is in several kernels cannot be told apart by its counter.
         alone = [sum(label in other for other in seconds) == 1 for label in labels]
-        if labels and all(alone) and all(label in trips for label in labels):
-            instructions = sum(trips[label] * per_pass[label][0] for label in labels)
-            gathers = sum(trips[label] * per_pass[label][1] for label in labels)
+        if all(alone) and all(label in trips for label in labels):
+            instructions, gathers = once[labels]
+            instructions += sum(trips[label] * per_pass[label][0] for label in labels)
+            gathers += sum(trips[label] * per_pass[label][1] for label in labels)
             least = instructions / limits["instructions_per_s"] + gathers / limits["gathers_per_s"]
             row |= {
                 "passes": {label: trips[label] for label in labels},

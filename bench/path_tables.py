@@ -108,7 +108,8 @@ def draw(air: str, found: Mapping[tuple[float, float], Mapping[str, np.ndarray]]
         for j, sun in enumerate(SUNS):
             one = found[altitude, sun]
             grids = []
-            for values in (one["paths"][:, 1], 100.0 * (one["tables"][:, 1] / one["paths"][:, 1] - 1.0)):
+            paths = np.where(one["paths"][:, 1] > 0.0, one["paths"][:, 1], np.nan)  # no path found the sun: no ratio
+            for values in (one["paths"][:, 1], 100.0 * (one["tables"][:, 1] / paths - 1.0)):
                 grid = np.full(one["inside"].shape, np.nan)
                 grid[one["inside"]] = values
                 grids.append(grid)

@@ -259,14 +259,55 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         self._light.prepare(first(self._values["sun_scale"]), first(self._values["sky_scale"]))
         self._variables = variables(self._light)
 
+    # ---- for the integrator atmosphere_path
+
+    @property
+    def sky(self) -> Sky:
+        """The solved sky."""
+        return self._sky
+
+    @property
+    def sky_light(self) -> Light:
+        """Sun and sky as tables."""
+        return self._light
+
+    @property
+    def altitude_m(self) -> float:
+        return first(self._values["altitude"])
+
+    @property
+    def up(self) -> np.ndarray:
+        """The zenith in world space, float64."""
+        up = host(self._to_world.matrix).reshape(4, 4)[:3, 2]
+        return up / np.linalg.norm(up)
+
+    @property
+    def sun(self) -> np.ndarray:
+        """Direction towards the sun in world space, float64."""
+        turn = host(self._to_world.matrix).reshape(4, 4)[:3, :3]
+        sun = turn @ host(self._light.sun)
+        return sun / np.linalg.norm(sun)
+
+    @property
+    def scales(self) -> tuple[Any, Any]:
+        """``sun_scale`` and ``sky_scale``."""
+        return single(self._values["sun_scale"]), single(self._values["sky_scale"])
+
+    def world(self, d: Any) -> Any:
+        """A direction of the local frame in world space."""
+        return dr.normalize(self._to_world @ d)
+
+    def local(self, d: Any) -> Any:
+        """A direction of world space in the local frame."""
+        return dr.normalize(self._to_world.inverse() @ d)
+
     # ---- light, in world space
 
     def _where(self, d: Any) -> Any:
-        return self._light.where(dr.normalize(self._to_world.inverse() @ d))
+        return self._light.where(self.local(d))
 
     def _radiance(self, where: Any, wavelengths: Any, active: Any) -> Any:
-        scales = single(self._values["sun_scale"]), single(self._values["sky_scale"])
-        return self._light.radiance(where, wavelengths, *scales, active)
+        return self._light.radiance(where, wavelengths, *self.scales, active)
 
     # ---- Mitsuba's interface
 
@@ -283,7 +324,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         local = self._light.sample(sample, active)
         where = self._light.where(local)
         ds = mi.DirectionSample3f()
-        ds.d = dr.normalize(self._to_world @ local)
+        ds.d = self.world(local)
         ds.n = -ds.d
         ds.dist = FAR
         ds.p = dr.fma(ds.d, FAR, it.p)
@@ -297,7 +338,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> tuple[Any, Any]:
         local = self._light.sample(sample3, active)
         where = self._light.where(local)
-        d = -dr.normalize(self._to_world @ local)
+        d = -self.world(local)
         wavelengths, weight = self._sample_wavelengths(sample1)
         centre, radius = bounds.sphere(self._scene)
         offset = mi.warp.square_to_uniform_disk_concentric(sample2)

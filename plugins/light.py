@@ -127,15 +127,36 @@ class Light:
         sky = dr.select(self._sky.covers(at.elevation), self._sky.pdf(at.elevation, at.place, active), 0.0)
         return dr.select(active, dr.fma(self._share, sun, self._rest * sky), 0.0)
 
+    @property
+    def sun_density(self) -> Any:
+        """Density per solid angle (1/sr) of directions drawn from the sun's disc."""
+        return self._sun.density
+
+    def sun_pdf(self, d: Any) -> Any:
+        """That density in a direction: 0 beside the disc."""
+        return dr.select(self._sun.distance2(d, self.sun) <= 1.0, self._sun.density, 0.0)
+
+    def sample_sun(self, sample: Any) -> Any:
+        """A direction within the sun's disc."""
+        return self._sun.sample(sample, self.sun)
+
+    def sky_pdf(self, d: Any) -> Any:
+        """Density per solid angle (1/sr) of :meth:`sample_sky`."""
+        at = self.where(d)
+        return dr.select(self._sky.covers(at.elevation), self._sky.pdf(at.elevation, at.place, True), 0.0)
+
+    def sample_sky(self, sample: Any, active: Any) -> Any:
+        """A direction in proportion to the radiance of the sky without the sun."""
+        z, phi = self._sky.sample(sample, active)
+        across = dr.safe_sqrt(dr.fma(-z, z, 1.0))
+        sin, cos = dr.sincos(phi)
+        hx, hy = self.heading
+        return mi.Vector3f(across * (cos * hx - sin * hy), across * (cos * hy + sin * hx), z)
+
     def sample(self, sample: Any, active: Any) -> Any:
         """A direction: of the sun's disc with probability ``share``, else of the sky."""
         last = 1.0 - 2.0**-24
         pick = sample.x < self._share
         first = mi.Point2f(dr.minimum(sample.x * self._share_inverse, last), sample.y)
         second = mi.Point2f(dr.clip((sample.x - self._share) * self._rest_inverse, 0.0, last), sample.y)
-        z, phi = self._sky.sample(second, active)
-        across = dr.safe_sqrt(dr.fma(-z, z, 1.0))
-        sin, cos = dr.sincos(phi)
-        hx, hy = self.heading
-        sky = mi.Vector3f(across * (cos * hx - sin * hy), across * (cos * hy + sin * hx), z)
-        return dr.normalize(dr.select(pick, self._sun.sample(first, self.sun), sky))
+        return dr.normalize(dr.select(pick, self.sample_sun(first), self.sample_sky(second, active)))

@@ -6,6 +6,7 @@ Bruneton's programs would compute.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,8 @@ from .sunlight import Sunlight
 TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
 SCATTERING = (32, 128, 8, 32)  # altitudes, view cosines, scattering angles, sun cosines
+# Quadrature nodes per piece of a ray, for suns above and below a cosine: what keeps 99 % of all texels within 0.3 %.
+TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 12
 
 
 @dataclass
@@ -61,8 +64,17 @@ class BrunetonTables:
         return sum(v.nbytes for v in (self.transmittance, self.irradiance, self.rayleigh, self.mie, self.higher))
 
 
-def bruneton_tables(sky: Sky, mu_s_min: float = -0.5, size: tuple[int, int, int, int] = SCATTERING) -> BrunetonTables:
-    """The tables of a solved sky, for suns down to the cosine ``mu_s_min``."""
+def bruneton_tables(
+    sky: Sky,
+    mu_s_min: float = -0.5,
+    size: tuple[int, int, int, int] = SCATTERING,
+    mie_weight: Callable[[int, np.ndarray], np.ndarray] | None = None,
+) -> BrunetonTables:
+    """The tables of a solved sky, for suns down to the cosine ``mu_s_min``.
+
+    ``mie_weight(species, nu)`` [..., W]: a factor to single scattering by an aerosol species, for clients that multiply
+    the sum by a phase function that is not its own.
+    """
     air = sky.atmosphere
     to = Bruneton(air.bottom_radius_m, air.top_radius_m, mu_s_min)
     h, mu = to.transmittance_inverse(*np.meshgrid(*map(texels, TRANSMITTANCE), indexing="ij"))
@@ -71,7 +83,7 @@ def bruneton_tables(sky: Sky, mu_s_min: float = -0.5, size: tuple[int, int, int,
     h, mu_s = to.irradiance_inverse(*np.meshgrid(*map(texels, IRRADIANCE), indexing="ij"))
     _, diffuse = sky.irradiance(h.ravel(), np.arccos(mu_s).ravel())
     irradiance = np.stack([e.numpy() for e in diffuse], axis=-1).reshape(*IRRADIANCE, -1)
-    parts = [_scattering(band, to, size) for band in sky.bands]
+    parts = [_scattering(band, to, size, mie_weight) for band in sky.bands]
     return BrunetonTables(
         to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
     )
@@ -112,42 +124,97 @@ def _views(to: Bruneton, altitudes: int, rows: int) -> tuple[np.ndarray, np.ndar
     return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (altitudes, rows))), ground
 
 
-def _scattering(band: Any, to: Bruneton, size: tuple[int, int, int, int]) -> list[np.ndarray]:
+def _scattering(
+    band: Any, to: Bruneton, size: tuple[int, int, int, int], mie_weight: Callable[[int, np.ndarray], np.ndarray] | None
+) -> list[np.ndarray]:
     """Rayleigh, Mie and higher orders of one band, [altitude, row, angle, sun, C]."""
     altitudes, rows, angles, suns = size
-    t, optics = types(), band.optics
-    h, mu, ground = _views(to, altitudes, rows)
-    lines = Sightlines(optics, np.repeat(h, rows), mu.ravel(), ground=np.tile(ground, altitudes))
-    mu_s = to.sun_inverse(texels(suns))
+    views = _views(to, altitudes, rows)
 
-    lane = dr.arange(t.UInt, altitudes * rows * angles * suns)
-    sun, rest = lane % suns, lane // suns
-    ray = rest // angles
-    cosine = dr.gather(t.Float, floats(mu_s), sun)
-    view = dr.gather(t.Float, floats(mu), ray)
-    nu = to.angle_inverse(t.Float(rest % angles) / (angles - 1.0), view, cosine)
-    sine, sin_s = (dr.sqrt((1.0 - c) * (1.0 + c)) for c in (view, cosine))
-    across = dr.clip((nu - view * cosine) / dr.maximum(sine, 1e-9), -sin_s, sin_s)
-    dr.eval(ray, cosine, across, nu)
+    def angle(index: Any, view: Any, cosine: Any) -> Any:
+        return to.angle_inverse(types().Float(index) / (angles - 1.0), view, cosine)
 
-    def array(values: list[Any]) -> np.ndarray:
-        return np.stack([v.numpy() for v in values], axis=-1).reshape(*size, -1)
+    weight = None
+    if mie_weight is not None:
+        nu = scattering_nodes(to, size)[3]
 
-    blank = np.zeros((*size, optics.channel_count), dtype=np.float32)
-    single = lines.single(Sunlight(optics, band.columns), ray, cosine, across, nu)
-    rayleigh, mie = blank, blank
-    for k, light in zip(optics.scatterers, single, strict=True):
-        if optics.constituents[k].name == "rayleigh":
-            rayleigh = array(light)
+        def weight(species: int) -> np.ndarray:
+            return mie_weight(species, nu)[..., band.optics.indices].astype(np.float32)
+
+    return scattered_light(band, views, to.sun_inverse(texels(suns)), angle, angles, weight)
+
+
+def scattered_light(
+    band: Any,
+    views: tuple[np.ndarray, np.ndarray, np.ndarray],
+    mu_s: np.ndarray,
+    angle: Callable[[Any, Any, Any], Any],
+    angles: int,
+    mie_weight: Callable[[int], np.ndarray] | None = None,
+) -> list[np.ndarray]:
+    """Single scattering by air and by all aerosols, without phase functions, and orders >= 2 of one band, each
+    [A, V, angles, suns, C].
+
+    ``views``: h [A] (m), mu [A, V] and whether the ray ends on the ground [V] or [A, V]; ``mu_s``: ascending [suns];
+    ``angle(index, mu, mu_s)``: nu on Dr.Jit arrays; ``mie_weight(species)``: a factor to single scattering by it.
+    """
+    optics, (h, mu, ground) = band.optics, views
+    ground = np.broadcast_to(ground, mu.shape)
+    size = (*mu.shape, angles, len(mu_s))
+    sunlight = Sunlight(optics, band.columns)
+    # Kernels run while NumPy prepares the next: nothing is fetched before all are under way.
+    mean = MeanSource(band, mu_s) if band.source is not None else None
+    # The planet's shadow lies across the rays of low suns, and takes a finer quadrature.
+    low = int(np.count_nonzero(mu_s < TWILIGHT))
+    parts, lines = [], None
+    for some, nodes in ((slice(0, low), TWILIGHT_NODES), (slice(low, None), DAY_NODES)):
+        if not len(mu_s[some]):
+            continue
+        lines = Sightlines(optics, np.repeat(h, mu.shape[1]), mu.ravel(), ground=ground.ravel(), nodes=nodes)
+        lanes = _Lanes(mu, mu_s[some], angle, angles)
+        parts.append(lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu))
+    higher = None
+    if mean is not None:
+        whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
+        edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
+        x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
+        series = Series(mean.along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
+        lanes = _Lanes(mu, mu_s, angle, angles)
+        higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
+        dr.eval(higher)
+    rayleigh = mie = np.zeros((*size, optics.channel_count), dtype=np.float32)
+    species = [c.name for c in optics.atmosphere.mie]
+    for k, *light in zip(optics.scatterers, *parts, strict=True):
+        name = optics.constituents[k].name
+        one = np.concatenate([_stacked(v, (*size[:3], -1, optics.channel_count)) for v in light], axis=3)
+        if name == "rayleigh":
+            rayleigh = one
         else:
-            mie = mie + array(light)
-    if band.source is None:
-        return [rayleigh, mie, blank]
-    whole = lines.scattering.reshape(altitudes, rows, *lines.scattering.shape[1:])
-    edge, end = view_range(to.bottom, to.top - to.bottom, h[:, None])
-    x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
-    series = Series(MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
-    cos_phi = dr.clip(across / dr.maximum(sin_s, 1e-9), -1.0, 1.0)
-    higher = series.at(ray * suns + sun, cos_phi)
-    dr.eval(higher)
-    return [rayleigh, mie, array(higher)]
+            mie = mie + (one if mie_weight is None else one * mie_weight(species.index(name)))
+    if higher is None:
+        return [rayleigh, mie, np.zeros_like(rayleigh)]
+    # Polynomials swing about 0 where no light is left.
+    return [rayleigh, mie, np.maximum(_stacked(higher, (*size, -1)), 0.0)]
+
+
+class _Lanes:
+    """All combinations [altitude, row, angle, sun], flattened, as Dr.Jit arrays: indices of ``ray`` and ``sun``, sun
+    ``cosine``, ``across`` = sin(sun zenith) cos(azimuth from the sun), ``cos_phi``, ``nu``."""
+
+    def __init__(self, mu: np.ndarray, mu_s: np.ndarray, angle: Callable[[Any, Any, Any], Any], angles: int) -> None:
+        t = types()
+        lane = dr.arange(t.UInt, mu.size * angles * len(mu_s))
+        self.sun, rest = lane % len(mu_s), lane // len(mu_s)
+        self.ray = rest // angles
+        self.cosine = dr.gather(t.Float, floats(mu_s), self.sun)
+        view = dr.gather(t.Float, floats(mu), self.ray)
+        self.nu = angle(rest % angles, view, self.cosine)
+        sine, sin_s = (dr.sqrt((1.0 - c) * (1.0 + c)) for c in (view, self.cosine))
+        self.across = dr.clip((self.nu - view * self.cosine) / dr.maximum(sine, 1e-9), -sin_s, sin_s)
+        self.cos_phi = dr.clip(self.across / dr.maximum(sin_s, 1e-9), -1.0, 1.0)
+        dr.eval(self.ray, self.cosine, self.across, self.nu)
+
+
+def _stacked(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Channels as the last axis."""
+    return np.stack([v.numpy() for v in values], axis=-1).reshape(shape)

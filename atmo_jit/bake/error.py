@@ -36,9 +36,9 @@ class Error:
 
 
 def compare(found: Sequence[Any], exact: Sequence[Any], where: dict[str, np.ndarray]) -> Error:
-    """Error of radiances, lists of W Floats; ``where``: arrays [N] that tell the views."""
-    dr.eval(found, exact)
-    got, true = (np.stack([v.numpy() for v in values]).astype(float) for values in (found, exact))
+    """Error of radiances, lists of W Floats or arrays [W, N]; ``where``: arrays [N] that tell the views."""
+    dr.eval([v for v in (found, exact) if not isinstance(v, np.ndarray)])
+    got, true = (np.stack([np.asarray(v) for v in values]).astype(float) for values in (found, exact))
     scale = np.maximum(true, DARKEST * true.max(axis=1, keepdims=True, initial=0.0))
     error = np.abs(got - true) / np.where(scale > 0.0, scale, 1.0)
     worst = int(error.max(axis=0).argmax())

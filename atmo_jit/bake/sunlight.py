@@ -10,7 +10,7 @@ from ..backend import packet, padded, stored, types
 from ..column import SunColumns
 from ..optics import Optics
 
-SIZE = (96, 320)  # altitudes, sun cosines
+SIZE = (192, 640)  # altitudes, sun cosines
 
 
 class Sunlight:

@@ -9,6 +9,7 @@ import pytest
 
 from atmo_jit.errors import InputError
 from atmo_jit.resolution import Resolution
+from bench.accuracy import all_orders_row
 from bench.methods import METHODS, OwnSky, method_of, number_in, scaled
 from bench.reference import Case
 from bench.truth import HAZE, LIMB, TWILIGHT, Truth, flags
@@ -38,6 +39,14 @@ def test_rows_by_group(truth):
     assert rows["day"]["beyond_max"] == pytest.approx(1.5) and rows["day"]["beyond_median"] == pytest.approx(0.5)
     assert rows["haze horizon"]["p95"] == pytest.approx(40.0)
     assert rows["horizon"]["cpu_s"] == 4.0
+
+
+def test_accuracy_and_the_groups_have_one_definition_of_the_95th_percentile(truth):
+    value = truth.L * (1 + np.linspace(-0.1, 0.2, 7))
+    day = np.flatnonzero(FLAG == 0)
+    row = all_orders_row(value, {"L": truth.L, "L_sigma": truth.sigma}, day)
+    expected = {key: truth.rows(value)[0][f"beyond_{key}"] for key in ("p95", "max")}
+    assert {key: row[key] for key in expected} == pytest.approx(expected)
 
 
 def test_rays_that_were_left_out_do_not_count(truth):

@@ -280,7 +280,7 @@ def test_derivatives_by_path_replay(plugins, reference):
 
     mi.set_variant("llvm_ad_mono")
     for _, difference, sigma in compare(2**18, [0, 14]):
-        assert np.all(np.abs(difference) < 0.02 + 4 * sigma)
+        assert np.all(np.abs(difference) < 0.02 + 3 * sigma)
         assert np.all(sigma < 0.3)
 
 
@@ -290,4 +290,4 @@ def test_all_derivatives_by_path_replay(plugins, reference):
 
     mi.set_variant("llvm_ad_mono")
     for row, difference, sigma in compare(2**20):
-        assert np.all(np.abs(difference) < 0.02 + 4 * sigma), row
+        assert np.all(np.abs(difference) < 0.02 + 3 * sigma), row

@@ -1,0 +1,267 @@
+"""The fit: from observations and a configuration to values, errors, and what they are worth.
+
+>>> from atmo_jit.fits import FitConfig, fit, load_observations
+>>> result = fit(load_observations("scan.npz"), FitConfig.load("fit.toml"))  # doctest: +SKIP
+>>> result.parameters["mie.phase.g"]["value"]  # doctest: +SKIP
+
+In steps, each from where the one before ended: a part of the samples; with a robust loss, once more with the scale of
+the residuals that were left; all samples, on nodes placed for the atmosphere found. Where the end is poor, other
+starting values are tried.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from atmo_jit.errors import InputError
+from atmo_jit.optics import MAX_CHANNELS
+
+from .config import FitConfig
+from .forward import ROUGH
+from .observations import Observations
+from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
+from .problem import HUBER, Evaluation, Problem, without_darkness
+from .uncertainty import Uncertainty, uncertainty
+from .wavelengths import at_wavelengths
+
+FEW = 300  # samples (directions) that the first steps look at
+UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
+POOR = 5.0  # residual over sigma, and
+POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
+RESTARTS = 3
+ROUNDS = 12  # of loss and weights, each of
+FIRST_ITERATIONS = 4
+STEPS_FORESEEN = 3
+MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
+LEAST_CLUSTERS = 6  # from which a scatter of means is known
+FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What :func:`fit` found: the ``problem`` and its ``u`` at the minimum, what was ``found`` there, ``errors``, how
+    it went, and ``unseen``: the samples of directions that are masked altogether, and what the fit predicts there."""
+
+    problem: Problem
+    u: np.ndarray
+    found: Evaluation
+    errors: Uncertainty
+    solution: Solution
+    starts: int
+    seconds: float
+    dropped: int
+    unseen: tuple[Observations, np.ndarray] | None
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Value of every scalar by name."""
+        return dict(zip((s.name for s in self.problem.scalars), self.problem.values(self.u).tolist(), strict=True))
+
+
+def fit(data: Observations, config: FitConfig, progress: Progress | None = None) -> Fit:
+    """Fit the free values of ``config`` to ``data``. ``progress`` is called with an estimate of the fraction done.
+
+    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right.
+    """
+    started = time.perf_counter()
+    air = at_wavelengths(config.atmosphere, data.wavelengths_nm)
+    before = np.count_nonzero(data.used)
+    if config.residual == "log":
+        data = without_darkness(data)
+    everything, data = data, data.part(np.flatnonzero(data.used.any(axis=1)))
+    samples = int(np.count_nonzero(data.used))
+    whole = Problem.of(replace(config, atmosphere=air), data)
+    _check_count(whole, samples)
+    few = _few(whole)
+    _check_units(few)
+    report = _Report(progress)
+    tries = []
+    for start in _starting_points(few):
+        tries.append(_minimum(few, start, report))
+        if tries[-1].solution.converged and not _poor(tries[-1]):
+            break
+        if len(tries) > RESTARTS:
+            break
+    # Poor ends are compared by their residuals, whose scale does not change with the loss.
+    best = min(tries, key=lambda end: _scale(end.left))
+    end = _polished(whole, whole.spread(few, best.solution.u), report)
+    problem, u, solution = end.problem, end.solution.u, end.solution
+    found = replace(problem.evaluate(u), jacobian=solution.jacobian)
+    errors = uncertainty(problem, u, found)
+    masked = everything.part(np.flatnonzero(~everything.used.any(axis=1)))
+    unseen = None
+    if len(masked.radiance):
+        unseen = masked, Problem(problem.config, masked, problem.model.at(masked), problem.leaves).evaluate(u).predicted
+    seconds = time.perf_counter() - started
+    return Fit(problem, u, found, errors, solution, len(tries), seconds, int(before - samples), unseen)
+
+
+class _Report:
+    """Progress over all minimisations: every iteration takes a share of what is left."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress, self._left, self.iterations = progress, 1.0, 0
+
+    def __call__(self, iteration: int, cost: float) -> None:
+        self.iterations += 1
+        self._left *= 0.9
+        if self._progress is not None:
+            self._progress(1.0 - self._left)
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a minimisation ended, and of what."""
+
+    problem: Problem
+    solution: Solution
+
+    @property
+    def left(self) -> np.ndarray:
+        """Residuals over sigma of the samples in use."""
+        return self.problem.evaluate(self.solution.u).raw[self.problem.data.used]
+
+
+def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
+    """The minimum for some of the samples from one start; with a loss and weights that suit what is left there."""
+    u, before = start, 0.0
+    for _ in range(ROUNDS):
+        if few.model.strays(few.atmosphere_values(u)):
+            few.model.place(few.atmosphere_values(u))
+        problem = _weighed(few, u)
+        solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS)
+        u = solution.u
+        if solution.converged and 0.7 < before / problem.excess < 1.4:
+            break
+        before = problem.excess
+    return _End(problem, solution)
+
+
+def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
+    """The minimum for all samples, on nodes for the atmosphere at ``u``."""
+    whole.model.place(whole.atmosphere_values(u))
+    problem = _weighed(whole, u)
+    last = _solve(problem, u, report, STEP_TOLERANCE)
+    return _End(problem, replace(last, iterations=report.iterations))
+
+
+def _weighed(problem: Problem, u: np.ndarray) -> Problem:
+    """The problem with loss and weights for the residuals that a step from ``u`` will leave.
+
+    Those at u may be far larger; with their weights priors would decide.
+    """
+    raw = problem.evaluate(u).raw[problem.data.used]
+    weighed = problem.with_loss(*_weights(problem, raw))
+    for _ in range(STEPS_FORESEEN):
+        at = weighed.evaluate(u, jacobian=True)
+        step = -np.linalg.lstsq(at.jacobian.T @ at.jacobian, at.jacobian.T @ at.residual, rcond=1e-12)[0]
+        weighed = problem.with_loss(*_weights(problem, raw + problem.raw_jacobian(u) @ step))
+    return weighed
+
+
+def _solve(
+    problem: Problem, u: np.ndarray, report: _Report, enough: float, iterations: int = MAX_ITERATIONS
+) -> Solution:
+    functions = Residuals(
+        lambda u: problem.evaluate(u).residual, lambda u: problem.evaluate(u, jacobian=True).jacobian
+    )
+    return minimise(
+        functions,
+        u,
+        method=problem.config.optimiser,
+        max_iterations=iterations,
+        step_tolerance=enough,
+        progress=report,
+    )
+
+
+def _scale(raw: np.ndarray) -> float:
+    """Robust standard deviation of the residuals over sigma."""
+    return 1.4826 * float(np.median(np.abs(raw)))
+
+
+def _weights(problem: Problem, raw: np.ndarray) -> tuple[float, float]:
+    """d of the loss and the excess for residuals over sigma of the samples in use."""
+    scale = _scale(raw)
+    huber = HUBER * max(1.0, scale) if problem.config.robust else np.inf
+    variance = scale**2 if problem.config.robust else float(raw @ raw) / len(raw)
+    if variance < MODEL_ERRS:
+        return huber, 1.0
+    bounded = np.clip(raw / np.sqrt(variance), -3.0, 3.0)
+    effects = [1.0]
+    for cluster in problem.clusters():
+        sizes = np.bincount(cluster)
+        sizes, sums = sizes[sizes > 0], np.bincount(cluster, bounded)[sizes > 0]
+        if len(sizes) >= LEAST_CLUSTERS:
+            effects.append(float(np.mean(sums**2 / sizes) / np.mean(bounded**2)))
+    return huber, variance * max(effects)
+
+
+def _poor(end: _End) -> bool:
+    """Whether the model is far from the data, in sigma and in per cent."""
+    found, data = end.problem.evaluate(end.solution.u), end.problem.data
+    relative = float(np.median(np.abs(found.predicted[data.used] / data.radiance[data.used] - 1.0)))
+    return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
+
+
+def _starting_points(whole: Problem) -> list[np.ndarray]:
+    """The start, then logarithmic scalars ten times larger and smaller and the others in the middle of their ranges."""
+    points = [whole.start]
+    for factor in (10.0, 0.1, 1.0):
+        middle = [
+            s.inner(s.start * factor) if s.logarithmic and not s.nuisance else 0.0 if s.bounded else s.inner(s.start)
+            for s in whole.scalars
+        ]
+        points.append(np.array(middle))
+    return points
+
+
+def _few(whole: Problem) -> Problem:
+    """The problem for some directions, and as many wavelengths as are solved at once."""
+    rows, count = _some(whole.data, FEW), len(whole.data.wavelengths_nm)
+    if whole.data.mixing is not None or count <= MAX_CHANNELS:
+        return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
+    order = np.argsort(whole.data.wavelengths_nm)
+    channels = np.sort(order[np.linspace(0, count - 1, MAX_CHANNELS).round().astype(int)])
+    return whole.part(rows, channels, max(whole.config.tolerance, ROUGH))
+
+
+def _some(data: Observations, count: int) -> np.ndarray:
+    """At most ``count`` rows, spread evenly over the order of the data, as many of each scan as it has part."""
+    total = len(data.radiance)
+    if total <= 2 * count:
+        return np.arange(total)
+    rows = np.sort(np.random.default_rng(0).permutation(total)[:count])
+    missing = [int(np.flatnonzero(data.scan == s)[0]) for s in range(data.scans) if not np.any(data.scan[rows] == s)]
+    return np.union1d(rows, np.array(missing, int))
+
+
+def _check_count(problem: Problem, samples: int) -> None:
+    unknowns = sum(not np.isfinite(s.prior_sigma) for s in problem.scalars)
+    if samples < max(unknowns, 1):
+        raise InputError(
+            f"observations: {samples} samples for {unknowns} unknowns without a prior; needed are at least {unknowns}"
+        )
+
+
+def _check_units(problem: Problem) -> None:
+    """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
+    if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
+        return  # the calibration is free: any unit will do
+    ratios = []
+    for factor in (1.0, 0.1, 10.0):
+        u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
+        predicted = problem.evaluate(np.array(u)).predicted
+        ratios.append(float(np.nanmedian(problem.data.radiance / np.maximum(predicted, 1e-30))))
+    ratio = min(ratios, key=lambda r: abs(np.log(max(r, 1e-30))))
+    if not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+        raise InputError(
+            f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
+            "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
+        )

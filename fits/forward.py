@@ -1,0 +1,184 @@
+"""The sky of an atmosphere for a list of samples, and how it changes with the atmosphere's values.
+
+Wavelengths do not know of each other: the radiance at one depends on the coefficients at that one only. So
+
+    d radiance[n, w] / d parameter  =  d radiance[n, w] / d leaf[w]  *  d leaf[w] / d parameter
+
+and one derivative by each leaf (``mie.scattering_per_m``), at all wavelengths at once, serves any number of
+parameters. Here it is a difference between two skies on the same nodes; both stand side by side as wavelengths of one
+atmosphere, so that they share all geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.backend import doubles
+from atmo_jit.optics import MAX_CHANNELS
+from atmo_jit.resolution import Resolution, column_of
+from atmo_jit.sky import Sky
+
+from .observations import Observations
+
+# Steps of differences, relative to the value: long enough for single precision, short enough for curvature (5e-3 of a
+# derivative at most, and a fit's minimum does not depend on it).
+STEP = 0.005
+SMALLEST = {"ground_albedo": 0.5, "g": 0.5, "single_scattering_albedo": 0.5}  # values below are stepped as these
+SUNS_DEG = 5.0  # suns are solved from and to multiples of this, so that small turns keep the nodes
+KEPT = 4  # skies
+ROUGH = 0.2  # tolerance of the skies that derivatives and first steps are taken from: 0.2 % off, in fact
+FOREIGN = 2.0  # factor of optical depth from which on an atmosphere's nodes are placed anew
+
+Values = Mapping[str, Any]
+
+
+class SkyModel:
+    """Radiance of samples (``altitude_m``, ``view_zenith`` [N], radians) for changed values of ``atmosphere``.
+
+    ``spectral``: dotted names of values per wavelength that will change; ``others``: of plain numbers (scale heights).
+    ``tolerance``: of the sky.
+    """
+
+    def __init__(
+        self,
+        atmosphere: Atmosphere,
+        altitude_m: np.ndarray,
+        view_zenith: np.ndarray,
+        tolerance: float,
+        spectral: tuple[str, ...],
+        others: tuple[str, ...] = (),
+    ) -> None:
+        self.atmosphere, self.tolerance = atmosphere, tolerance
+        self.altitude_m, self.view_zenith = altitude_m, view_zenith
+        self.spectral, self.others = spectral, others
+        self._layout: Atmosphere | None = None
+        self.layout_number = 0
+        self._resolution, self._rough = Resolution(), Resolution()
+        self._solved: dict[Any, Sky] = {}
+        self._views = (doubles(altitude_m), doubles(view_zenith))
+
+    def at(
+        self, data: Observations, atmosphere: Atmosphere | None = None, tolerance: float | None = None
+    ) -> SkyModel:
+        """The model for other samples, other wavelengths, another tolerance; with the same nodes if neither is given.
+        """
+        air, tolerance = atmosphere or self.atmosphere, tolerance or self.tolerance
+        other = SkyModel(air, data.altitude_m, data.view_zenith, tolerance, self.spectral, self.others)
+        if air is self.atmosphere and tolerance == self.tolerance:
+            other._resolution, other._rough, other._layout = self._resolution, self._rough, self._layout
+        return other
+
+    def place(self, values: Values) -> None:
+        """Choose resolution and nodes for these values; they stay, so that skies differ by their values only."""
+        self._layout = self.atmosphere.replace(values)
+        self._resolution = Resolution.suited(self._layout, self.tolerance)
+        self._rough = Resolution.suited(self._layout, max(self.tolerance, ROUGH))
+        self.layout_number += 1
+        self._solved.clear()
+
+    def strays(self, values: Values) -> bool:
+        """Whether the nodes in use were placed for much thinner or thicker air."""
+        if self._layout is None:
+            return True
+        here, there = (_depths(air) for air in (self.atmosphere.replace(values), self._layout))
+        return bool(np.any(np.abs(np.log2(np.maximum(here, 0.02) / np.maximum(there, 0.02))) > np.log2(FOREIGN)))
+
+    def radiance(
+        self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, *, rough: bool = False
+    ) -> np.ndarray:
+        """Radiance [N, W] with the values under the dotted names of ``values`` replaced; angles in radians [N].
+        ``rough``: at the resolution of derivatives."""
+        return self._evaluate([values], values, sun_zenith, azimuth, rough)
+
+    def derivatives(self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray) -> dict[str, np.ndarray]:
+        """d radiance[n, w] / d value[w] for every name of ``values``, [N, W]."""
+        count = len(self.atmosphere.wavelengths_nm)
+        spectral = [name for name in self.spectral if name in values]
+        found = {}
+        if spectral:
+            steps = [self._step(name, values[name]) for name in spectral]
+            stepped = [
+                {**values, name: np.asarray(values[name]) + step} for name, step in zip(spectral, steps, strict=True)
+            ]
+            light = self._evaluate([values, *stepped], values, sun_zenith, azimuth, rough=True)
+            for i, (name, step) in enumerate(zip(spectral, steps, strict=True), 1):
+                found[name] = (light[:, i * count : (i + 1) * count] - light[:, :count]) / step
+        for name in self.others:
+            step = 4.0 * STEP * float(values[name])  # nodes move along, so both sides and farther
+            ends = [
+                self.radiance({**values, name: float(values[name]) + sign * step}, sun_zenith, azimuth, rough=True)
+                for sign in (1.0, -1.0)
+            ]
+            found[name] = (ends[0] - ends[1]) / (2.0 * step)
+        return found
+
+    @staticmethod
+    def _step(name: str, value: Any) -> np.ndarray:
+        """Step [W] or a number: toward the inside of the range for fractions."""
+        last = name.rpartition(".")[2]
+        size = np.maximum(np.abs(value), SMALLEST.get(last, 1e-9)) * STEP
+        return np.where(np.asarray(value) > 0.5, -size, size) if last in SMALLEST else size
+
+    def _spread(self, several: list[Values]) -> Atmosphere:
+        """One atmosphere with the wavelengths of several, one after the other, and as many of the last again as fill
+        the bands, so that all bands run the same kernels."""
+        base = self.atmosphere
+        airs = [base.replace(values) for values in several]
+        total = len(airs) * len(base.wavelengths_nm)
+        size = -(-total // MAX_CHANNELS) * MAX_CHANNELS
+        index = np.minimum(np.arange(size), total - 1)
+        document = airs[0].to_dict()
+
+        def gathered(read: Any) -> list[float]:
+            columns = [np.broadcast_to(read(air), base.wavelengths_nm.shape) for air in airs]
+            return np.concatenate(columns)[index].tolist()
+
+        for name in ("wavelengths_nm", "solar_irradiance", "ground_albedo"):
+            document[name] = gathered(lambda air, name=name: getattr(air, name))
+        for i, constituent in enumerate(base.constituents):
+            part: Any = document
+            for key in constituent.name.split("."):
+                part = part[int(key)] if isinstance(part, list) else part[key]
+            for key in ("scattering_per_m", "absorption_per_m", "single_scattering_albedo"):
+                if key in part:
+                    part[key] = gathered(lambda air, i=i, key=key: getattr(air.constituents[i], key))
+            if "g" in part.get("phase", {}):
+                part["phase"]["g"] = gathered(lambda air, i=i: air.constituents[i].phase.g)
+        return Atmosphere(document)
+
+    def _evaluate(
+        self, several: list[Values], values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, rough: bool
+    ) -> np.ndarray:
+        """Radiance for several sets of values side by side: [N, sets x W]."""
+        if self._layout is None:
+            self.place(values)
+        sky = self._sky(self._spread(several), values, sun_zenith, self._rough if rough else self._resolution)
+        light = sky.rays(self._views[0], doubles(sun_zenith), self._views[1], doubles(azimuth))
+        dr.eval(light.radiance)
+        count, columns = len(self.view_zenith), len(several) * len(self.atmosphere.wavelengths_nm)
+        return np.stack([np.broadcast_to(v.numpy(), count) for v in light.radiance[:columns]], axis=-1).astype(float)
+
+    def _sky(self, air: Atmosphere, values: Values, sun_zenith: np.ndarray, resolution: Resolution) -> Sky:
+        """The solved sky, kept: suns and azimuths change without another solve."""
+        suns = (
+            np.radians(SUNS_DEG) * np.floor(np.degrees(sun_zenith.min()) / SUNS_DEG),
+            np.radians(SUNS_DEG) * np.ceil(np.degrees(sun_zenith.max()) / SUNS_DEG),
+        )
+        key = (hash(air), suns, resolution)
+        if key not in self._solved:
+            while len(self._solved) >= KEPT:
+                self._solved.pop(next(iter(self._solved)))
+            layout = self._layout.replace({name: values[name] for name in self.others})
+            tolerance = self.tolerance if resolution == self._resolution else ROUGH
+            self._solved[key] = Sky(air, tolerance=tolerance, resolution=resolution, suns=suns, layout=layout)
+        return self._solved[key]
+
+
+def _depths(air: Atmosphere) -> np.ndarray:
+    """Largest vertical optical depth of every constituent."""
+    return np.array([float(np.max(c.extinction_per_m)) * column_of(air, c) for c in air.constituents])

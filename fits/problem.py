@@ -1,0 +1,295 @@
+"""The least-squares problem of a fit: residuals of samples and priors, and their derivatives, for a vector of unknowns.
+
+    predicted = calibration x mixing . L(atmosphere, sun zenith + turn, azimuth - turn)
+    residual  = (ln predicted - ln measured) / relative sigma,     or (predicted - measured) / sigma
+
+With a robust loss a residual r becomes f(r), f^2 / 2 = d^2 (sqrt(1 + (r / d)^2) - 1) (pseudo-Huber): quadratic up to
+about d, then linear, so that clouds, masts and what the model cannot follow do not decide. Priors stay quadratic.
+
+Where residuals are larger than sigma it is the model that errs, and its errors are alike at neighbouring directions and
+wavelengths: hundreds of samples then count as few. ``excess`` says by how much their weight is lowered against that of
+the priors; it is the variance of the residuals over sigma, times the design effect of Kish 1965, Survey Sampling,
+section 5.4: how much more the means of parts of the sky, or of wavelengths, scatter than means of independent samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .config import FitConfig
+from .forward import SkyModel
+from .observations import Observations
+from .parameters import Leaf, Scalar, leaf_of
+from .wavelengths import at_wavelengths
+
+TURN = np.radians(0.02)  # step of differences by the sun's angles
+HUBER = 1.345  # robust scale at which a Gaussian sample loses 5 % of its worth (Huber 1964)
+SKY_PARTS = (3, 6)  # in zenith angle and azimuth: directions at which the model's errors are taken to be alike
+LEAST = 1e-30  # of a predicted radiance whose logarithm is taken
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """At one point: ``predicted`` [N, C]; ``raw`` residuals [N, C] over sigma, NaN where no sample is in use;
+    ``residual`` [M], those of samples with the loss in them, then those of the priors; ``jacobian`` [M, P] of it by
+    u, None if it was not asked for."""
+
+    predicted: np.ndarray
+    raw: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray | None = None
+
+
+class Problem:
+    """Unknowns ``scalars``: those of the atmosphere's leaves, then the nuisances of every scan.
+
+    ``huber``: d of the loss, infinite for plain least squares. ``excess``: variance of a sample in units of sigma^2.
+    """
+
+    def __init__(
+        self,
+        config: FitConfig,
+        data: Observations,
+        model: SkyModel,
+        leaves: tuple[Leaf, ...],
+        huber: float = np.inf,
+        excess: float = 1.0,
+    ) -> None:
+        self.config, self.data, self.model, self.leaves = config, data, model, leaves
+        self.huber, self.excess = huber, excess
+        self._last: dict[Any, Any] = {}
+        self._nuisances = _nuisances(config, data)
+        self.scalars = (*(s for leaf in leaves for s in leaf.scalars), *(n.scalar for n in self._nuisances))
+        self.logarithmic = config.residual == "log"
+        self._used = data.used
+        self._measured = np.log(np.maximum(data.radiance, LEAST)) if self.logarithmic else data.radiance
+        self._sigma = np.where(self._used, data.sigma / data.radiance if self.logarithmic else data.sigma, np.nan)
+
+    @classmethod
+    def of(cls, config: FitConfig, data: Observations) -> Problem:
+        """The problem of a configuration whose atmosphere is at the observations' wavelengths."""
+        leaves = tuple(leaf_of(config.atmosphere, name, spec) for name, spec in config.free.items())
+        spectral = tuple(x.name for x in leaves if np.ndim(x.values(_starts(x))) or x.name.endswith(".g"))
+        others = tuple(leaf.name for leaf in leaves if leaf.name not in spectral)
+        model = SkyModel(config.atmosphere, data.altitude_m, data.view_zenith, config.tolerance, spectral, others)
+        return cls(config, data, model, leaves)
+
+    def with_loss(self, huber: float, excess: float) -> Problem:
+        """The same with another loss and weight of the samples."""
+        other = Problem(self.config, self.data, self.model, self.leaves, huber, excess)
+        other._last = self._last
+        return other
+
+    def part(
+        self, rows: np.ndarray, channels: np.ndarray | None = None, tolerance: float | None = None
+    ) -> Problem:
+        """The same for some of the samples, and some of the wavelengths, with another tolerance of the sky."""
+        data, air, leaves = self.data.part(rows), self.model.atmosphere, self.leaves
+        if channels is not None:
+            air = at_wavelengths(air, data.wavelengths_nm[channels])
+            data, leaves = data.channels(channels), tuple(leaf.at(channels) for leaf in leaves)
+        return Problem(self.config, data, self.model.at(data, air, tolerance), leaves, self.huber, self.excess)
+
+    def spread(self, part: Problem, u: np.ndarray) -> np.ndarray:
+        """u of all scalars from that of a part's; those of other wavelengths are interpolated."""
+        known = dict(zip((s.name for s in part.scalars), u, strict=True))
+        families: dict[str, list[tuple[float, float]]] = {}
+        for scalar in part.scalars:
+            if scalar.wavelength_nm is not None:
+                families.setdefault(scalar.family, []).append((scalar.wavelength_nm, known[scalar.name]))
+        found = []
+        for scalar in self.scalars:
+            if scalar.name not in known:
+                nm, values = zip(*sorted(families[scalar.family]), strict=True)
+                known[scalar.name] = float(np.interp(scalar.wavelength_nm, nm, values))
+            found.append(known[scalar.name])
+        return np.array(found)
+
+    def gathered(self, part: Problem, u: np.ndarray) -> np.ndarray:
+        """u of a part's scalars from that of all."""
+        known = dict(zip((s.name for s in self.scalars), u, strict=True))
+        return np.array([known[s.name] for s in part.scalars])
+
+    @property
+    def start(self) -> np.ndarray:
+        """u of the starting values."""
+        return np.array([s.inner(s.start) for s in self.scalars])
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The scalars' values."""
+        return np.array([s.value(x) for s, x in zip(self.scalars, u, strict=True)])
+
+    def atmosphere_values(self, u: np.ndarray) -> dict[str, Any]:
+        """Values of the atmosphere under their dotted names."""
+        v, found, first = self.values(u), {}, 0
+        for leaf in self.leaves:
+            found[leaf.name] = leaf.values(v[first : first + len(leaf.scalars)])
+            first += len(leaf.scalars)
+        return found
+
+    def evaluate(self, u: np.ndarray, jacobian: bool = False) -> Evaluation:
+        """Residuals at u, and their derivatives by u."""
+        predicted, raw = self._kept("raw", u, self._raw)
+        loss, slope = (v / np.sqrt(self.excess) for v in _pseudo_huber(raw[self._used], self.huber))
+        priors = [s.prior_residual(x) for s, x in zip(self.scalars, u, strict=True)]
+        with_prior = [i for i, s in enumerate(self.scalars) if np.isfinite(s.prior_sigma)]
+        residual = np.concatenate([loss, [priors[i][0] for i in with_prior]])
+        if not jacobian:
+            return Evaluation(predicted, raw, residual)
+        columns = self.raw_jacobian(u) * slope[:, None]
+        below = np.zeros((len(with_prior), len(self.scalars)))
+        below[np.arange(len(with_prior)), with_prior] = [priors[i][1] for i in with_prior]
+        return Evaluation(predicted, raw, residual, np.concatenate([columns, below]))
+
+    def raw_jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives by u of the residuals over sigma of the samples in use, without the loss."""
+        return self._kept("jacobian", u, self._raw_jacobian)
+
+    def _kept(self, what: str, u: np.ndarray, make: Callable[[np.ndarray], Any]) -> Any:
+        """What ``make`` returns at u on the nodes in use; the last few are kept for problems that share samples."""
+        key = what, u.tobytes(), self.model.layout_number
+        if key not in self._last:
+            while len(self._last) >= 6:
+                self._last.pop(next(iter(self._last)))
+            self._last[key] = make(u)
+        return self._last[key]
+
+    def _raw(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        v, values = self.values(u), self.atmosphere_values(u)
+        factor, sun_zenith, azimuth = self._geometry_of(v)
+        predicted = factor * self._mixed(self.model.radiance(values, sun_zenith, azimuth))
+        return predicted, (self._compared(predicted) - self._measured) / self._sigma
+
+    def _raw_jacobian(self, u: np.ndarray) -> np.ndarray:
+        v, values = self.values(u), self.atmosphere_values(u)
+        factor, sun_zenith, azimuth = self._geometry_of(v)
+        predicted, _ = self._kept("raw", u, self._raw)
+        columns = np.zeros((np.count_nonzero(self._used), len(self.scalars)))
+        scale = 1.0 / (np.maximum(predicted, LEAST) * self._sigma) if self.logarithmic else 1.0 / self._sigma
+        slopes = np.array([s.slopes(x)[0] for s, x in zip(self.scalars, u, strict=True)])
+        by_leaf = self.model.derivatives(values, sun_zenith, azimuth)
+        first = 0
+        for leaf in self.leaves:
+            v_leaf = v[first : first + len(leaf.scalars)]
+            for k, spread in enumerate(leaf.slopes(v_leaf)):
+                change = factor * self._mixed(by_leaf[leaf.name] * spread)
+                columns[:, first + k] = (scale * change)[self._used]
+            first += len(leaf.scalars)
+        turned: dict[str, np.ndarray] = {}
+        for i, nuisance in enumerate(self._nuisances, first):
+            if nuisance.kind.endswith("calibration"):
+                change = predicted / v[i]
+            else:
+                if nuisance.kind not in turned:
+                    turned[nuisance.kind] = self._turned(nuisance.kind, values, sun_zenith, azimuth)
+                change = factor * self._mixed(turned[nuisance.kind])
+            columns[:, i] = np.where(nuisance.applies, scale * change, 0.0)[self._used]
+        return columns * slopes
+
+    def clusters(self) -> list[np.ndarray]:
+        """For every sample in use, numbers of its part of the sky (SKY_PARTS) and scan, and of its channel and scan."""
+        data = self.data
+        row, channel = np.nonzero(self._used)
+        zeniths, azimuths = SKY_PARTS
+        up = np.clip((1.0 - np.cos(data.view_zenith)) * zeniths, 0, zeniths - 1).astype(int)
+        around = ((data.azimuth % (2.0 * np.pi)) / (2.0 * np.pi) * azimuths).astype(int) % azimuths
+        part = (data.scan * zeniths + up) * azimuths + around
+        return [part[row], data.scan[row] * data.radiance.shape[1] + channel]
+
+    def geometry(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Calibration [N, C], zenith angle of the sun and azimuth from it [N] (radians) at u."""
+        return self._geometry_of(self.values(u))
+
+    def _geometry_of(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Calibration [N, C], sun zenith and azimuth [N] with the nuisances in them."""
+        data = self.data
+        factor, zenith, azimuth = np.ones(data.radiance.shape), data.sun_zenith.copy(), data.azimuth.copy()
+        first = len(self.scalars) - len(self._nuisances)
+        for nuisance, value in zip(self._nuisances, v[first:], strict=True):
+            if nuisance.kind.endswith("calibration"):
+                factor = np.where(nuisance.applies, factor * value, factor)
+            elif nuisance.kind == "sun_zenith":
+                zenith = zenith + np.where(nuisance.applies[:, 0], np.radians(value), 0.0)
+            else:
+                azimuth = azimuth - np.where(nuisance.applies[:, 0], np.radians(value), 0.0)
+        over = zenith < 0.0  # past the zenith: the same direction from the other side
+        return factor, np.clip(np.abs(zenith), 0.0, np.pi), np.where(over, azimuth + np.pi, azimuth)
+
+    def _turned(self, kind: str, values: dict[str, Any], zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+        """Derivative [N, W] of radiance by a turn of the sun, per degree."""
+        ends = []
+        for sign in (1.0, -1.0):
+            if kind == "sun_zenith":
+                ends.append(self.model.radiance(values, np.abs(zenith + sign * TURN), azimuth, rough=True))
+            else:
+                ends.append(self.model.radiance(values, zenith, azimuth - sign * TURN, rough=True))
+        return (ends[0] - ends[1]) / (2.0 * np.degrees(TURN))
+
+    def _mixed(self, light: np.ndarray) -> np.ndarray:
+        return light if self.data.mixing is None else light @ self.data.mixing.T
+
+    def _compared(self, predicted: np.ndarray) -> np.ndarray:
+        return np.log(np.maximum(predicted, LEAST)) if self.logarithmic else predicted
+
+
+@dataclass(frozen=True)
+class _Nuisance:
+    """A nuisance of one scan: ``applies`` bool [N, C] to which samples."""
+
+    kind: str
+    scalar: Scalar
+    applies: np.ndarray
+
+
+def _nuisances(config: FitConfig, data: Observations) -> list[_Nuisance]:
+    found = []
+    for kind, spec in config.nuisance.items():
+        for scan in range(data.scans):
+            here = np.broadcast_to((data.scan == scan)[:, None], data.radiance.shape)
+            label = kind if data.scans == 1 else f"{kind}[scan {scan}]"
+            if kind == "spectral_calibration":
+                names = data.wavelengths_nm if data.mixing is None else np.arange(float(len(data.mixing)))
+                for c, nm in enumerate(names):
+                    alone = here & (np.arange(data.radiance.shape[1]) == c)
+                    name = f"{label}[{nm:g} nm]" if data.mixing is None else f"{label}[channel {nm:g}]"
+                    found.append(_Nuisance(kind, replace(_factor(name, spec), wavelength_nm=float(nm)), alone))
+            elif kind == "calibration":
+                found.append(_Nuisance(kind, _factor(label, spec), here))
+            else:
+                sigma = spec.get("sigma", np.inf)
+                start, widest = spec.get("start", 0.0), 180.0 if kind == "sun_azimuth" else 30.0
+                low, high = spec.get("min", start - widest), spec.get("max", start + widest)
+                scalar = Scalar(label, start, low, high, start, sigma, 1.0, nuisance=True)
+                found.append(_Nuisance(kind, scalar, here))
+    return found
+
+
+def _factor(label: str, spec: dict[str, Any]) -> Scalar:
+    start = spec.get("start", 1.0)
+    sigma = spec.get("sigma", np.inf)
+    scale = min(sigma, 1.0)
+    return Scalar(label, start, prior=start, prior_sigma=sigma, scale=scale, positive=True, nuisance=True)
+
+
+def _starts(leaf: Leaf) -> np.ndarray:
+    return np.array([s.start for s in leaf.scalars])
+
+
+def _pseudo_huber(r: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
+    """f(r) and f'(r)."""
+    if not np.isfinite(d):
+        return r, np.ones_like(r)
+    root = np.sqrt(1.0 + (r / d) ** 2)
+    # f / r without cancellation for small r: root - 1 = (r / d)^2 / (root + 1).
+    quotient = np.sqrt(2.0 / (root + 1.0))
+    return r * quotient, 1.0 / (root * quotient)
+
+
+def without_darkness(data: Observations) -> Observations:
+    """The samples whose logarithm can be taken."""
+    with np.errstate(invalid="ignore"):
+        return replace(data, radiance=np.where(data.radiance > 0.0, data.radiance, np.nan))
