@@ -12,7 +12,7 @@ A skip never changes the result beyond rounding: what is left out would have add
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 # Prediction and measurement may differ by this factor before it is said.
 OFF = 2.0
+SAMPLE, FINEST = 500, 1e-3  # views at which errors are looked at, least tolerance of what they are compared with
 SUN_STEP_DEG = 2.0  # suns that are solved begin and end at multiples of it: the next sun then finds the same grid
 
 
@@ -123,6 +124,27 @@ def compared(predicted: float, measured: float, what: str, unit: str) -> str | N
     if predicted <= 0.0 or measured <= 0.0 or 1.0 / OFF <= measured / predicted <= OFF:
         return None
     return f"{what}: predicted {predicted:.3g} {unit}, found {measured:.3g} {unit}, off by more than {OFF:g}x"
+
+
+def error_found(made: Plan, views: Mapping[str, np.ndarray]) -> float:
+    """How far a plan's radiance is from that of a tolerance ten times as small, 95th percentile in per cent, at some of
+    its ``views`` (as from check_views).
+
+    Errors that both solves share are not in it: it is no more than the error that ``predicted`` means.
+    """
+    from .backend import doubles
+    from .bake.error import compare
+    from .sky import Sky
+
+    count = len(views["altitude_m"])
+    sample = np.random.default_rng(0).permutation(count)[:SAMPLE]
+    some = {name: values[sample] for name, values in views.items()}
+    columns = [doubles(some["altitude_m"])]
+    columns += [doubles(np.radians(some[name])) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
+    columns += [doubles(some["distance_m"])] if "distance_m" in some else []
+    finer = Sky(made.atmosphere, made.orders, max(0.1 * made.tolerance, FINEST))
+    found, exact = (sky.rays(*columns).radiance for sky in (made.solve(), finer))
+    return 100.0 * compare(found, exact, {}).p95
 
 
 def _without_nothing(air: Atmosphere, free: Sequence[str]) -> Atmosphere:

@@ -5,6 +5,7 @@ Run from the repository root::
     python -m bench.tables            # everything, text
     python -m bench.tables --json
     python -m bench.tables --part sky-view|4d|froxels|time
+    python -m bench.tables --part time --threads 1    # where other programs run: none waits for another
 
 Errors are those of :mod:`atmo_jit.bake.error`: at random views half a degree off the horizon, relative, in per cent.
 Times are medians of warm kernels; CPU time is that of all threads, waiting ones included.
@@ -192,11 +193,12 @@ def times(name: str) -> Iterator[Row]:
 
     suns = iter(0.3 + 1e-3 * np.arange(100_000))
     tables = Tables4D(sky)
-    scattering = sky.atmosphere.mie[0].scattering_per_m
+    changed = max((c for c in sky.atmosphere.constituents if c.phase is not None), key=lambda c: c.name != "rayleigh")
     planned = plan(name, Needs.of_observer(name, 1.0, 45.0))
 
     def another() -> Atmosphere:
-        return sky.atmosphere.replace({"mie.scattering_per_m": scattering * (1.0 + next(suns))})
+        more = changed.scattering_per_m * (1.0 + next(suns))
+        return sky.atmosphere.replace({f"{changed.name}.scattering_per_m": more})
 
     def march(count: int = 20_000) -> None:
         rng = np.random.default_rng(0)
@@ -251,7 +253,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.tables", description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     parser.add_argument("--part", choices=tuple(PARTS), help="only this part")
+    parser.add_argument("--threads", type=int, metavar="N", help="how many to use (default: all cores)")
     options = parser.parse_args(arguments)
+    if options.threads:
+        dr.set_thread_count(options.threads)
     found: dict[str, list[Row]] = {}
     for part in [options.part] if options.part else PARTS:
         if not options.json:

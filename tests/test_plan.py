@@ -15,7 +15,7 @@ from atmo_jit.costs import Cost
 from atmo_jit.errors import AtmosphereError, InputError
 from atmo_jit.harmonics import pair_count
 from atmo_jit.needs import TABLE_NODES, Needs
-from atmo_jit.plan import compared, plan
+from atmo_jit.plan import OFF, compared, error_found, plan
 from atmo_jit.resolution import Stage
 from atmo_jit.sky import Sky, sky
 from atmo_jit.views import check_views
@@ -273,6 +273,15 @@ def test_suns_that_are_not_looked_at_are_not_solved(altitude, sun):
 def test_all_suns_are_solved_where_views_have_them():
     views = {"view_zenith_deg": 40.0, "sun_zenith_deg": np.linspace(0.0, 105.0, 9)}
     assert made(views=views).solved_suns_deg is None and " of " not in item(made(views=views), "sun angles").size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hillaire2020", "mars", "small planet"])
+def test_errors_are_as_predicted_for_atmospheres_that_were_not_measured(name):
+    air = Atmosphere.load(WORLDS.get(name, name))
+    views = check_views(views_of(air.to_dict(), 40))
+    planned = plan(air, Needs.of_views(air, views), tolerance=0.01)
+    assert 0.0 < error_found(planned, views) < OFF * planned.predicted.error_percent
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])

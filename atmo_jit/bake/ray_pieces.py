@@ -189,6 +189,9 @@ class Nodes:
 
 
 def sums(values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next."""
-    running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    return running[first[1:]] - running[first[:-1]]
+    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next, none from differences."""
+    total = np.zeros((len(first) - 1, *values.shape[1:]))
+    some = np.flatnonzero(np.diff(first))
+    if len(some):
+        total[some] = np.add.reduceat(values, first[some])
+    return total
