@@ -27,7 +27,7 @@ def defined(nodes, names):
 def test_functions_of_the_method_exist(name):
     folder = "." if name.startswith("plugins.") else "atmo_jit"
     parts = name.split(".")
-    count = 2 if name.startswith(("plugins.", "bake.")) else 1
+    count = 2 if name.startswith(("plugins.", "bake.", "export.")) else 1
     file = ROOT / folder / "/".join(parts[:count])
     tree = ast.parse(file.with_suffix(".py").read_text(encoding="utf-8"))
     assert defined(tree.body, parts[count:])
