@@ -21,7 +21,7 @@ from ..phase import RayleighPhase
 from ..sky import Sky
 from .mean_source import MeanSource, Series, view_range
 from .sightlines import Sightlines
-from .sunlight import Sunlight
+from .sunlight import FINE, Sunlight
 
 TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
@@ -161,7 +161,7 @@ def scattered_light(
     optics, (h, mu, ground) = band.optics, views
     ground = np.broadcast_to(ground, mu.shape)
     size = (*mu.shape, angles, len(mu_s))
-    sunlight = Sunlight(optics, band.columns)
+    sunlight = Sunlight(optics, band.columns, FINE)
     # Kernels run while NumPy prepares the next: nothing is fetched before all are under way.
     mean = MeanSource(band, mu_s) if band.source is not None else None
     # The planet's shadow lies across the rays of low suns, and takes a finer quadrature.

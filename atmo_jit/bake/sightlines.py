@@ -23,7 +23,6 @@ from ..march import relative_azimuth
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
 from ..single_scattering import horizontal_irradiance
-from .sunlight import SIZE as SUNLIGHT
 from .sunlight import Sunlight
 
 NODES = 3  # Gauss-Legendre nodes per piece
@@ -158,8 +157,9 @@ class Sightlines:
         return np.array([np.asarray(c.profile.density(h)) for c in constituents]).reshape(len(constituents), *h.shape)
 
     def _table(self, sine: np.ndarray, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
-        """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's
-        centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in cosines."""
+        """Per point: square root of altitude over thickness, horizon cosine, 1 / (1 - horizon), cosine and sine of the
+        turn about the planet's centre, the ray's zenith cosine there, half the stretch over r, half the disc's height
+        in cosines."""
         atmosphere = self.optics.atmosphere
         h, r = self._altitude(ray, distance)
         horizon = -np.sqrt(h * (2.0 * atmosphere.bottom_radius_m + h)) / r
@@ -167,7 +167,7 @@ class Sightlines:
         return floats(
             np.column_stack(
                 [
-                    np.sqrt(np.clip(h / atmosphere.thickness_m, 0.0, 1.0)) * (SUNLIGHT[0] - 1),
+                    np.sqrt(np.clip(h / atmosphere.thickness_m, 0.0, 1.0)),
                     horizon,
                     1.0 / (1.0 - horizon),
                     (self.r[ray] + distance * self.mu[ray]) / r,
@@ -196,13 +196,13 @@ class Sightlines:
         solar = self.optics.solar
 
         def node(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, horizon, scale, cos_turn, sin_turn, mu, half, disc = packet(self._nodes, i, 8)
+            root, horizon, scale, cos_turn, sin_turn, mu, half, disc = packet(self._nodes, i, 8)
             there = dr.fma(cos_turn, mu_s, sin_turn * across)
             above = there - horizon
             width = dr.maximum(disc, dr.abs(dr.fma(-there, mu, nu)) * half)
             x = dr.clip(dr.fma(0.5, above / width, 0.5), 0.0, 1.0)
             seen = x * x * dr.fma(-2.0, x, 3.0)
-            light = sunlight.at(row, dr.sqrt(dr.maximum(above * scale, 0.0)))
+            light = sunlight.at(root, dr.sqrt(dr.maximum(above * scale, 0.0)))
             weight = packet(self._weights, i, kinds * size)
             for n in range(kinds):
                 for c in range(channels):
@@ -223,12 +223,12 @@ class Sightlines:
         t = types()
         kinds, channels = len(self.optics.scatterers), self.optics.channel_count
         size = padded(channels)
-        per_row = self.optics.thickness / (SUNLIGHT[0] - 1.0) ** 2
+        thickness = self.optics.thickness
 
         def stretch(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
+            root, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
             there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
-            toward = source.scattered(row * row * per_row, there, mu, relative_azimuth(mu, there, nu), True)
+            toward = source.scattered(root * root * thickness, there, mu, relative_azimuth(mu, there, nu), True)
             weight = packet(self._stretch_weights, i, kinds * size)
             for n in range(kinds):
                 for c in range(channels):

@@ -10,7 +10,8 @@ from ..backend import packet, padded, stored, types
 from ..column import SunColumns
 from ..optics import Optics
 
-SIZE = (192, 640)  # altitudes, sun cosines
+SIZE = (96, 320)  # altitudes, sun cosines
+FINE = (192, 640)  # for tables that are exact at their texels
 
 
 class Sunlight:
@@ -28,9 +29,11 @@ class Sunlight:
         depths = optics.optical_depths(columns.toward(h, dr.fma(1.0 - horizon, x * x, horizon)))
         self.table = stored([dr.exp(-d) for d in depths], lane, self.size)
 
-    def at(self, row: Any, x: Any) -> list[Any]:
-        """Per channel (and padding), at a fractional row and at sqrt((mu_s - horizon) / (1 - horizon))."""
+    def at(self, root: Any, x: Any) -> list[Any]:
+        """Per channel (and padding), at the square root of altitude over thickness and at sqrt((mu_s - horizon) / (1 -
+        horizon))."""
         t = types()
+        row = root * (self.rows - 1.0)
         x = dr.minimum(x, 1.0) * (self.cosines - 1)
         j, i = dr.minimum(t.Int(x), self.cosines - 2), dr.minimum(t.Int(row), self.rows - 2)
         fx, fy = x - t.Float(j), row - t.Float(i)
