@@ -70,9 +70,8 @@ class Linearization:
     @cached_property
     def value(self) -> dict[str, np.ndarray]:
         """See the class."""
-        made = [on_device(part) for part in self._numbers]
         evaluation, arguments = self._evaluating(by_views=False)
-        return self._arrays(evaluation(made, *arguments))
+        return self._arrays(evaluation(self._made, *arguments))
 
     def jacobian(self, names: Sequence[str], output: str = "radiance") -> dict[str, np.ndarray]:
         """Derivatives of one output by name: [N, W]; [N, W, n] for the n nodes of a profile.
@@ -124,34 +123,42 @@ class Linearization:
         of_views = sorted(set(names) & set(VIEWS))
         adjoints: tuple[Any, Any] = [], {}
         if of_values or of_views:
-            made = [on_device(part) for part in self._numbers]
             columns = [floats(column) for column in np.concatenate(weights, axis=-1).T]
             evaluation, arguments = self._evaluating(by_views=bool(of_views))
-            adjoints = evaluation.reverse(made, *arguments, columns, of_values, of_views)
+            adjoints = evaluation.reverse(self._made, *arguments, columns, of_values, of_views)
         found = {name: adjoints[1][name].numpy() for name in of_views}
+        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints[0]]
         for name in names:
             if name in RADII:
                 change = self._by_radius(name)
                 found[name] = np.sum([np.vdot(w, change[o]) for w, o in zip(weights, OUTPUTS, strict=True)])
             elif name not in VIEWS:
-                found[name] = self._pulled_back(name, adjoints[0])
+                found[name] = self._pulled_back(name, host)
         return found
 
-    def _pulled_back(self, name: str, adjoints: list[dict[str, Any]]) -> np.ndarray:
-        """Derivative by a parameter from those by the values of every band."""
-        value = described(self.atmosphere, name)
-        by_entry = np.zeros(np.size(value))
-        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints]
-        for optics, part in zip(self._optics, host, strict=True):
-            for entry in range(np.size(value)):
-                if per_wavelength(self.atmosphere, name) and entry not in optics.indices:
-                    continue
-                direction = np.eye(np.size(value))[entry].reshape(np.shape(value))
-                steps = like(self._numbers[0], tangent(optics, name, direction, self._degrees, self._phase_degree))
-                for group, adjoint in part.items():
-                    along = [leaf.numpy() for leaf in flat(on_device(steps[group]))]
-                    by_entry[entry] += sum(np.vdot(a, b) for a, b in zip(adjoint, along, strict=True))
-        return by_entry.reshape(np.shape(value))
+    def _pulled_back(self, name: str, adjoints: list[dict[str, list[np.ndarray]]]) -> np.ndarray:
+        """Derivative by a parameter from those by the values of every band.
+
+        Channels do not mix between a parameter and the values, nor do nodes of a profile: one step of all of them
+        serves each.
+        """
+        value, nodes = described(self.atmosphere, name), ".profile." in name
+        found = np.zeros(np.shape(value))
+        for optics, numbers, adjoint in zip(self._optics, self._numbers, adjoints, strict=True):
+            step = tangent(optics, name, np.ones_like(value), self._degrees, self._phase_degree)
+            steps = like(numbers, step)
+            for group in self._groups(name):
+                along = flat(steps[group])
+                parts = [grad.reshape(len(d), -1)[:, : d.shape[1]] if d.ndim == 2 else grad.reshape(d.shape)
+                    for grad, d in zip(adjoint[group], along, strict=True)]
+                products = [a * b for a, b in zip(parts, along, strict=True)]
+                if nodes:
+                    found += sum(p for p, d in zip(products, along, strict=True) if np.any(d))
+                elif per_wavelength(self.atmosphere, name):
+                    found[optics.indices] += optics.by_channel(like(steps[group], products))
+                else:
+                    found += sum(np.sum(p) for p in products)
+        return found
 
     def _groups(self, name: str) -> tuple[str, ...]:
         """The values, by name, that carry derivatives when those by a parameter are asked for.
@@ -208,6 +215,10 @@ class Linearization:
     @cached_property
     def _numbers(self) -> list[dict[str, Any]]:
         return [optics.numbers(optics.atmosphere, self._degrees, self._phase_degree) for optics in self._optics]
+
+    @cached_property
+    def _made(self) -> list[dict[str, Any]]:
+        return [on_device(part) for part in self._numbers]
 
     @property
     def _optics(self) -> list[Optics]:
@@ -274,9 +285,8 @@ class Linearization:
             parts = [tangent(optics, *seed, self._degrees, self._phase_degree) for seed in own]
             steps = like(numbers, [sum(leaves) for leaves in zip(*parts, strict=True)])
             values.append(on_device({group: steps[group] for group in groups}))
-        made = [on_device(part) for part in self._numbers]
         evaluation, arguments = self._evaluating(by_views=views is not None)
-        outputs, changes = evaluation.forward(made, *arguments, values, views)
+        outputs, changes = evaluation.forward(self._made, *arguments, values, views)
         self.__dict__.setdefault("value", self._arrays(outputs))
         return self._arrays(changes)
 

@@ -176,7 +176,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             numbers |= {name: getattr(found.moment, name) for name in Moment.names()}
         self._values = {name: array(value) for name, value in numbers.items()}
         self._sun_direction = mi.Vector3f(*found.direction)
-        self._atmosphere_values = {name: array(self._given(name)) for name in self._atmosphere.names()}
+        self._atmosphere_values = {name: array(self._atmosphere.given(name)) for name in self._atmosphere.names()}
         self._seen = {name: host(value) for name, value in self._atmosphere_values.items()}
         self._sky: Sky | None = None
         self._scene: Any = None
@@ -210,13 +210,6 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             self._prepare()
         else:
             self._solve()
-
-    def _given(self, name: str) -> Any:
-        """A value as the description has it: one number stays one number."""
-        node: Any = self._atmosphere.to_dict()
-        for key in name.split("."):
-            node = node[int(key)] if isinstance(node, list) else node[key]
-        return node
 
     def _albedo_values(self) -> np.ndarray | None:
         return None if self._albedo is None else albedo.values(self._albedo, self._atmosphere.wavelengths_nm)
