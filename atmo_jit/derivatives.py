@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere
-from .backend import doubles, floats, traversing, types
+from .backend import doubles, evaluated, floats, traversing, types
 from .errors import InputError
 from .optics import Optics, on_device
 from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, per_wavelength, tangent
@@ -31,6 +31,7 @@ OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
 GEOMETRY = ("radius", "thickness")  # of Optics.values, and
 SHAPE = ("profiles", "sun_radius")  # with these, nothing that is kept with a grid serves
 PROFILE = ("scale_height_m", "center_m", "half_width_m")
+MANY = 1024  # views from which on it is worth to see whether they make a table
 RADIUS_STEP = 5e-3  # of the planet's radius, and
 THICKNESS_STEP = 2e-2  # of its atmosphere's thickness: the light is nearly linear over them
 
@@ -69,8 +70,8 @@ class Linearization:
     @cached_property
     def value(self) -> dict[str, np.ndarray]:
         """See the class."""
-        made = [on_device(part) for part in self._numbers]
-        return self._arrays(self._evaluation(made, *self._arguments))
+        evaluation, arguments = self._evaluating(by_views=False)
+        return self._arrays(evaluation(self._made, *arguments))
 
     def jacobian(self, names: Sequence[str], output: str = "radiance") -> dict[str, np.ndarray]:
         """Derivatives of one output by name: [N, W]; [N, W, n] for the n nodes of a profile.
@@ -122,33 +123,42 @@ class Linearization:
         of_views = sorted(set(names) & set(VIEWS))
         adjoints: tuple[Any, Any] = [], {}
         if of_values or of_views:
-            made = [on_device(part) for part in self._numbers]
             columns = [floats(column) for column in np.concatenate(weights, axis=-1).T]
-            adjoints = self._evaluation.reverse(made, *self._arguments, columns, of_values, of_views)
+            evaluation, arguments = self._evaluating(by_views=bool(of_views))
+            adjoints = evaluation.reverse(self._made, *arguments, columns, of_values, of_views)
         found = {name: adjoints[1][name].numpy() for name in of_views}
+        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints[0]]
         for name in names:
             if name in RADII:
                 change = self._by_radius(name)
                 found[name] = np.sum([np.vdot(w, change[o]) for w, o in zip(weights, OUTPUTS, strict=True)])
             elif name not in VIEWS:
-                found[name] = self._pulled_back(name, adjoints[0])
+                found[name] = self._pulled_back(name, host)
         return found
 
-    def _pulled_back(self, name: str, adjoints: list[dict[str, Any]]) -> np.ndarray:
-        """Derivative by a parameter from those by the values of every band."""
-        value = described(self.atmosphere, name)
-        by_entry = np.zeros(np.size(value))
-        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints]
-        for optics, part in zip(self._optics, host, strict=True):
-            for entry in range(np.size(value)):
-                if per_wavelength(self.atmosphere, name) and entry not in optics.indices:
-                    continue
-                direction = np.eye(np.size(value))[entry].reshape(np.shape(value))
-                steps = like(self._numbers[0], tangent(optics, name, direction, self._degrees, self._phase_degree))
-                for group, adjoint in part.items():
-                    along = [leaf.numpy() for leaf in flat(on_device(steps[group]))]
-                    by_entry[entry] += sum(np.vdot(a, b) for a, b in zip(adjoint, along, strict=True))
-        return by_entry.reshape(np.shape(value))
+    def _pulled_back(self, name: str, adjoints: list[dict[str, list[np.ndarray]]]) -> np.ndarray:
+        """Derivative by a parameter from those by the values of every band.
+
+        Channels do not mix between a parameter and the values, nor do nodes of a profile: one step of all of them
+        serves each.
+        """
+        value, nodes = described(self.atmosphere, name), ".profile." in name
+        found = np.zeros(np.shape(value))
+        for optics, numbers, adjoint in zip(self._optics, self._numbers, adjoints, strict=True):
+            step = tangent(optics, name, np.ones_like(value), self._degrees, self._phase_degree)
+            steps = like(numbers, step)
+            for group in self._groups(name):
+                along = flat(steps[group])
+                parts = [grad.reshape(len(d), -1)[:, : d.shape[1]] if d.ndim == 2 else grad.reshape(d.shape)
+                    for grad, d in zip(adjoint[group], along, strict=True)]
+                products = [a * b for a, b in zip(parts, along, strict=True)]
+                if nodes:
+                    found += sum(p for p, d in zip(products, along, strict=True) if np.any(d))
+                elif per_wavelength(self.atmosphere, name):
+                    found[optics.indices] += optics.by_channel(like(steps[group], products))
+                else:
+                    found += sum(np.sum(p) for p in products)
+        return found
 
     def _groups(self, name: str) -> tuple[str, ...]:
         """The values, by name, that carry derivatives when those by a parameter are asked for.
@@ -206,6 +216,10 @@ class Linearization:
     def _numbers(self) -> list[dict[str, Any]]:
         return [optics.numbers(optics.atmosphere, self._degrees, self._phase_degree) for optics in self._optics]
 
+    @cached_property
+    def _made(self) -> list[dict[str, Any]]:
+        return [on_device(part) for part in self._numbers]
+
     @property
     def _optics(self) -> list[Optics]:
         return [band.optics for band in self.sky.solutions]
@@ -217,6 +231,31 @@ class Linearization:
         rays, _, _ = self.sky.enter(*_where(views))
         pieces = [Pieces.of(optics, rays) for optics in self._optics]
         return views, pieces, [band.field.shares for band in self.sky.solutions]
+
+    @cached_property
+    def _product(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """View zenith angles and azimuths (degrees) of many views that are all combinations of the two, row by row,
+        seen from one place under one sun; None: they are not."""
+        views = self.views
+        single = all(np.ptp(views[name]) == 0.0 for name in VIEWS[:2])
+        inside = views["altitude_m"][0] <= self.atmosphere.thickness_m
+        if self.rays < MANY or "distance_m" in views or self._options["sun_disc"] or not (single and inside):
+            return None
+        zenith, azimuth = views["view_zenith_deg"], views["azimuth_deg"]
+        count = int(np.argmax(zenith != zenith[0])) or self.rays
+        rows = zenith[::count]
+        if self.rays % count or not np.array_equal(zenith, np.repeat(rows, count)):
+            return None
+        return (rows, azimuth[:count]) if np.array_equal(azimuth, np.tile(azimuth[:count], len(rows))) else None
+
+    def _evaluating(self, *, by_views: bool) -> tuple[Any, tuple[Any, ...]]:
+        """What evaluates the sky, and its arguments beside values."""
+        if by_views or self._product is None:
+            return self._evaluation, self._arguments
+        views = {name: doubles(values[:1]) for name, values in self.views.items()}
+        place = (self.views["altitude_m"][0], np.radians(self.views["sun_zenith_deg"][0]))
+        shares = [band.field.shares for band in self.sky.solutions]
+        return _TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product)), (views, None, shares)
 
     @cached_property
     def _evaluation(self) -> _Evaluation:
@@ -246,8 +285,8 @@ class Linearization:
             parts = [tangent(optics, *seed, self._degrees, self._phase_degree) for seed in own]
             steps = like(numbers, [sum(leaves) for leaves in zip(*parts, strict=True)])
             values.append(on_device({group: steps[group] for group in groups}))
-        made = [on_device(part) for part in self._numbers]
-        outputs, changes = self._evaluation.forward(made, *self._arguments, values, views)
+        evaluation, arguments = self._evaluating(by_views=views is not None)
+        outputs, changes = evaluation.forward(self._made, *arguments, values, views)
         self.__dict__.setdefault("value", self._arrays(outputs))
         return self._arrays(changes)
 
@@ -325,6 +364,38 @@ class _Evaluation:
         changes = dr.grad(outputs)
         dr.eval(changes)
         return dr.detach(outputs), changes
+
+
+class _TableEvaluation(_Evaluation):
+    """The same for all combinations of view zenith angles and azimuths (radians) from one place under one sun, far
+    faster than ray by ray (bundle.py); not recorded."""
+
+    def __init__(
+        self,
+        sky: Sky,
+        options: dict[str, Any],
+        altitude_m: float,
+        sun_zenith: float,
+        view_zenith: np.ndarray,
+        azimuth: np.ndarray,
+    ) -> None:
+        super().__init__(sky, options)
+        self._recorded = False
+        self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
+
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, shares: list[Any]) -> list[Any]:
+        t, sky = types(), self._sky.again(values, shares)
+        altitude, sun_zenith = self._place
+        ground = self._options["ground"]
+        light = sky.table(altitude, self._view_zenith, sun_zenith, self._azimuth, ground=ground)
+        lane = dr.arange(t.UInt, len(self._view_zenith) * len(self._azimuth))
+        rows = lane // len(self._azimuth)
+        transmittance = [dr.gather(t.Float, evaluated(v), rows) for v in light.transmittance]
+        sun, scattered = sky.irradiance(*(doubles([v]) for v in self._place))
+        zero = dr.zeros(t.Float, dr.width(lane))
+        outputs = [v + zero for v in (*light.radiance, *transmittance, *sun, *scattered)]
+        dr.eval(outputs)
+        return outputs
 
 
 def _where(views: dict[str, Any]) -> list[Any]:

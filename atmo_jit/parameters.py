@@ -42,10 +42,8 @@ def check_names(atmosphere: Atmosphere, names: Sequence[str], views: Collection[
 
 def described(atmosphere: Atmosphere, name: str) -> float | np.ndarray:
     """The value of a name as the description has it: one number that stands for all wavelengths stays one number."""
-    node: Any = atmosphere.to_dict()
-    for key in name.split("."):
-        node = node[int(key)] if isinstance(node, list) else node[key]
-    return np.array(node, dtype=np.float64) if isinstance(node, list) else float(node)
+    value = atmosphere.given(name)
+    return np.array(value, dtype=np.float64) if isinstance(value, list) else float(value)
 
 
 def per_wavelength(atmosphere: Atmosphere, name: str) -> bool:
