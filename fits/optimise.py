@@ -15,7 +15,7 @@ import numpy as np
 
 MAX_ITERATIONS = 60
 # Part of the standard errors below which a step changes nothing that matters.
-STEP_TOLERANCE = 0.05
+STEP_TOLERANCE = 0.1
 LEAST_GAIN = 0.1
 FAR = 1e6
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
