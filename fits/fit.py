@@ -79,6 +79,7 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     whole = Problem.of(replace(config, atmosphere=air), data)
     _check_count(whole, samples)
     few = _few(whole)
+    few.model.place(few.atmosphere_values(few.start))
     _check_units(few)
     report = _Report(progress)
     tries = []
@@ -254,14 +255,15 @@ def _check_units(problem: Problem) -> None:
     """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
     if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
         return  # the calibration is free: any unit will do
-    ratios = []
+    ratio = np.inf
     for factor in (1.0, 0.1, 10.0):
         u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
-        predicted = problem.evaluate(np.array(u)).predicted
-        ratios.append(float(np.nanmedian(problem.data.radiance / np.maximum(predicted, 1e-30))))
-    ratio = min(ratios, key=lambda r: abs(np.log(max(r, 1e-30))))
-    if not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
-        raise InputError(
-            f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
-            "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
-        )
+        predicted = problem.evaluate(np.array(u)).predicted[problem.data.used]
+        found = float(np.median(problem.data.radiance[problem.data.used] / np.maximum(predicted, 1e-30)))
+        ratio = min(ratio, found, key=lambda r: abs(np.log(max(r, 1e-30))))
+        if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+            return
+    raise InputError(
+        f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
+        "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
+    )

@@ -15,7 +15,7 @@ import numpy as np
 
 MAX_ITERATIONS = 60
 # Part of the standard errors below which a step changes nothing that matters.
-STEP_TOLERANCE = 0.05
+STEP_TOLERANCE = 0.1
 LEAST_GAIN = 0.1
 FAR = 1e6
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
@@ -166,13 +166,13 @@ def _levenberg_marquardt(
                 return done(u, iteration, True, f"steps no longer gain {enough:g} standard errors")
             continue
         failures += 1
+        # What the step promised; the cost's own rounding may hide less than a small part of a standard error.
+        promised = -0.5 * float(step @ np.asarray(state.gradient))
+        small = promised < 0.5 * len(start) * max(enough, LEAST_GAIN) ** 2
         if not functions.exact:
             functions.renewed(u)
             state = solver.init_state(u)
-        elif float(np.max(np.abs(step))) < 1e-7 or failures > 5:
-            # What the step promised: the cost's own rounding hides less than a small part of a standard error.
-            promised = -float(step @ np.asarray(state.gradient)) / 2.0
-            small = promised < 0.5 * len(start) * max(enough, LEAST_GAIN) ** 2
+        elif small or failures > 5:
             reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
             return done(u, iteration, small, reason)
     return done(u, max_iterations, False, f"{max_iterations} iterations were not enough")

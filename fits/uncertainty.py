@@ -98,10 +98,13 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 def _sentences(
     scalars: tuple[Scalar, ...], values: np.ndarray, kernel: np.ndarray, alone: np.ndarray, model_error: np.ndarray
 ) -> tuple[str, ...]:
-    """What the data cannot tell, in words."""
-    found = []
+    """What the data cannot tell, in words; values per wavelength in one sentence."""
+    found, unknown = [], {}
     for i, scalar in enumerate(scalars):
         if scalar.nuisance:
+            continue
+        if kernel[i] < NARROWED and scalar.wavelength_nm is not None:
+            unknown.setdefault(scalar.family, []).append(scalar.wavelength_nm)
             continue
         if kernel[i] < NARROWED:
             by = "its prior" if np.isfinite(scalar.prior_sigma) else "its bounds"
@@ -124,4 +127,7 @@ def _sentences(
                 f"{scalar.name} is not identifiable while {scalars[j].name} is free: the data change in the same way "
                 f"with both (correlation {alone[i, j]:.2f})."
             )
+    for family, wavelengths in unknown.items():
+        at = ", ".join(f"{nm:g}" for nm in wavelengths)
+        found.append(f"{family} is not identifiable at {at} nm: its prior or bounds say more than the data.")
     return tuple(found)
