@@ -64,8 +64,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: more orders are
-    solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved.``scattering_too``:
+    see Optics; ``sure``: more orders are solved, for derivatives (SURE); ``nodes``: solve on the nodes for this
+    atmosphere, if they suit (Grid.suits). Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Sky:
         *,
         scattering_too: Collection[str] = (),
         sure: bool = False,
+        nodes: Atmosphere | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
@@ -88,6 +90,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         self._suns = suns
+        self.nodes = nodes if nodes is not None and Grid.suits(nodes, self.atmosphere) else self.atmosphere
         self._bands: list[_Band] = []
         for i in range(0, count, MAX_CHANNELS):
             optics = Optics(self.atmosphere, np.arange(i, min(i + MAX_CHANNELS, count)), scattering_too)
@@ -98,7 +101,7 @@ class Sky:
     @property
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
-        return Grid.of(self.atmosphere, self.resolution, self._suns)
+        return Grid.of(self.nodes, self.resolution, self._suns)
 
     def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
         """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
