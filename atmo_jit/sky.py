@@ -64,9 +64,9 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved.``scattering_too``:
-    see Optics; ``sure``: more orders are solved, for derivatives (SURE); ``nodes``: solve on the nodes for this
-    atmosphere, if they suit (Grid.suits). Raises AtmosphereError, LLVMError, InputError.
+    be asked for; light under other suns is not solved. ``scattering_too``: see Optics; ``sure``: more orders are
+    solved, for derivatives (SURE); ``nodes``: solve on the nodes for this atmosphere, if they suit (Grid.suits).
+    Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
