@@ -177,7 +177,7 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
     t = types()
     s = dr.minimum(t.UInt(x), suns - 2)
     taps = cubic(x - t.Float(s))
-    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    corners = [row(table, first + s + n, orders * channels, alone=True) for n in range(4)]
     cos_m, cos_before = 1.0, cos_phi
     total = [0.0] * channels
     for m in range(orders):
