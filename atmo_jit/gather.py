@@ -200,8 +200,8 @@ def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int,
     node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun
 
     def add(l_: Any, sums: list[Any], entries: int = width) -> tuple[Any, list[Any]]:
-        weight = row(weights, visit * rows + l_, entries, width)
-        value = row(moments, node * rows + l_, entries, width)
+        weight = row(weights, visit * rows + l_, entries, width, alone=True)
+        value = row(moments, node * rows + l_, entries, width, alone=True)
         return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums[:entries], strict=True)] + sums[entries:]
 
     sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
