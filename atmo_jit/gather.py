@@ -179,7 +179,7 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
     t = types()
     s = dr.minimum(t.UInt(x), suns - 2)
     taps = cubic(x - t.Float(s))
-    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    corners = [row(table, first + s + n, orders * channels, alone=True) for n in range(4)]
     cos_m, cos_before = 1.0, cos_phi
     total = [0.0] * channels
     for m in range(orders):
@@ -204,7 +204,9 @@ def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int,
     size = dr.opaque(t.UInt, rows, 1)
 
     def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        weight, value = (row(table, place * size + l_, width) for table, place in ((weights, visit), (moments, node)))
+        weight, value = (
+            row(table, place * size + l_, width, alone=True) for table, place in ((weights, visit), (moments, node))
+        )
         return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums, strict=True)]
 
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
