@@ -36,10 +36,7 @@ def write_all(folder: Path, files: Sequence[File]) -> int:
 
     Raises OSError when a file does not read back as it was meant; files that were there before then stay.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"output {str(folder)!r}: cannot be made a folder ({error.strerror})") from None
+    folder.mkdir(parents=True, exist_ok=True)
     with atomic_outputs(*(folder / file.name for file in files)) as parts:
         with ThreadPoolExecutor() as pool:  # compression leaves Python's lock to others
             for _ in pool.map(_write_and_check, files, parts):
