@@ -27,7 +27,7 @@ TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
 SCATTERING = (32, 128, 8, 32)  # altitudes, view cosines, scattering angles, sun cosines
 # Quadrature nodes per piece of a ray, for suns above and below a cosine: what keeps 99 % of all texels within 0.3 %.
-TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 16
+TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 12
 
 
 @dataclass
@@ -162,6 +162,8 @@ def scattered_light(
     ground = np.broadcast_to(ground, mu.shape)
     size = (*mu.shape, angles, len(mu_s))
     sunlight = Sunlight(optics, band.columns)
+    # Kernels run while NumPy prepares the next: nothing is fetched before all are under way.
+    mean = MeanSource(band, mu_s) if band.source is not None else None
     # The planet's shadow lies across the rays of low suns, and takes a finer quadrature.
     low = int(np.count_nonzero(mu_s < TWILIGHT))
     parts, lines = [], None
@@ -170,27 +172,29 @@ def scattered_light(
             continue
         lines = Sightlines(optics, np.repeat(h, mu.shape[1]), mu.ravel(), ground=ground.ravel(), nodes=nodes)
         lanes = _Lanes(mu, mu_s[some], angle, angles)
-        single = lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu)
-        parts.append([_stacked(light, (*size[:3], len(mu_s[some]))) for light in single])
+        parts.append(lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu))
+    higher = None
+    if mean is not None:
+        whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
+        edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
+        x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
+        series = Series(mean.along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
+        lanes = _Lanes(mu, mu_s, angle, angles)
+        higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
+        dr.eval(higher)
     rayleigh = mie = np.zeros((*size, optics.channel_count), dtype=np.float32)
     species = [c.name for c in optics.atmosphere.mie]
     for k, *light in zip(optics.scatterers, *parts, strict=True):
-        name, whole = optics.constituents[k].name, np.concatenate(light, axis=3)
+        name = optics.constituents[k].name
+        one = np.concatenate([_stacked(v, (*size[:3], -1, optics.channel_count)) for v in light], axis=3)
         if name == "rayleigh":
-            rayleigh = whole
+            rayleigh = one
         else:
-            mie = mie + (whole if mie_weight is None else whole * mie_weight(species.index(name)))
-    if band.source is None:
+            mie = mie + (one if mie_weight is None else one * mie_weight(species.index(name)))
+    if higher is None:
         return [rayleigh, mie, np.zeros_like(rayleigh)]
-    whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
-    edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
-    x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
-    series = Series(MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
-    lanes = _Lanes(mu, mu_s, angle, angles)
-    higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
-    dr.eval(higher)
     # Polynomials swing about 0 where no light is left.
-    return [rayleigh, mie, np.maximum(_stacked(higher, size), 0.0)]
+    return [rayleigh, mie, np.maximum(_stacked(higher, (*size, -1)), 0.0)]
 
 
 class _Lanes:
@@ -213,4 +217,4 @@ class _Lanes:
 
 def _stacked(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
     """Channels as the last axis."""
-    return np.stack([v.numpy() for v in values], axis=-1).reshape(*shape, -1)
+    return np.stack([v.numpy() for v in values], axis=-1).reshape(shape)

@@ -80,11 +80,12 @@ class MeanSource:
         up = np.broadcast_to(up, x.shape)
         for half, nodes in ((up, slice(0, self.up)), (~up, slice(self.up, v))):
             matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
+        scattering = scattering.astype(np.float32)[:, :, None, None]
         total = np.zeros((*x.shape, *rest), dtype=np.float32)
-        for k, kind in enumerate(values):
-            mean = (matrix @ kind).reshape(*x.shape, *rest)
-            mean *= scattering[:, :, None, None, k].astype(np.float32)
-            total += mean
+        for i, k in np.ndindex(len(h), kinds):  # an altitude at a time stays in the cache
+            mean = (matrix[i] @ values[k, i]).reshape(total.shape[1:])
+            mean *= scattering[i, ..., k, :]
+            total[i] += mean
         return total
 
 

@@ -169,7 +169,8 @@ def source(name: str, content: str) -> File:
     )
 
 
-LARGEST_HALF, SMALLEST_HALF = 65504.0, 6.1e-5  # the latter is normal: below it digits are lost
+# Below its smallest normal number, whose bits these are, half precision loses digits.
+LARGEST_HALF, SMALLEST_HALF, SMALLEST_NORMAL = 65504.0, 6.1e-5, 0x0400
 
 
 def halved(name: str, values: np.ndarray, warnings: list[str]) -> np.ndarray:
@@ -181,10 +182,13 @@ def halved(name: str, values: np.ndarray, warnings: list[str]) -> np.ndarray:
             f"{name}: its largest value is {largest:.3g}; half precision holds up to {LARGEST_HALF:g} (scale "
             "solar_irradiance down)"
         )
-    small = np.count_nonzero((values > 0.0) & (values < SMALLEST_HALF)) / max(np.count_nonzero(values > 0.0), 1)
+    half = values.astype(np.float16)
+    bits = half.view(np.uint16)
+    small = np.count_nonzero(bits < SMALLEST_NORMAL) - np.count_nonzero(values == 0.0)
+    small /= max(np.count_nonzero(bits), 1)
     if small > 1e-3:
         warnings.append(
             f"{name}: {100.0 * small:.1f} % of its positive values are below {SMALLEST_HALF:g}, where half precision "
             "loses digits (deep twilight, short rays)"
         )
-    return values.astype(np.float16)
+    return half
