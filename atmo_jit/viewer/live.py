@@ -18,7 +18,7 @@ from .. import __version__
 from .._fields import Range, number
 from ..atmosphere import Atmosphere
 from ..backend import doubles
-from ..bake.client import IRRADIANCE, SCATTERING, TRANSMITTANCE, view_rows
+from ..bake.client import IRRADIANCE, SCATTERING, TRANSMITTANCE, Block, view_rows
 from ..bake.error import compare
 from ..bake.sightlines import Sightlines
 from ..errors import InputError, shown
@@ -34,6 +34,16 @@ from .controls import MU_S_MIN, changed, check, controls
 
 VIEWS, OFF_HORIZON_DEG = 500, 0.5  # of the error estimate for one observer and sun
 ALTITUDES, SUNS = SCATTERING[0], SCATTERING[3]
+# What the page shows first; angles in degrees, azimuths clockwise from north.
+START = {
+    "altitude_m": 500.0,
+    "sun_zenith_deg": 75.0,
+    "sun_azimuth_deg": 180.0,
+    "yaw_deg": 170.0,
+    "pitch_deg": 12.0,
+    "fov_deg": 70.0,
+    "stops": 0.0,
+}
 
 
 class Live:
@@ -59,6 +69,7 @@ class Live:
         return {
             "name": self.name,
             "version": __version__,
+            "start": START,
             "controls": controls(self.air),
             "bottom_radius_m": self.air.bottom_radius_m,
             "thickness_m": self.air.thickness_m,
@@ -81,20 +92,25 @@ class Live:
         """The atmosphere with the controls at ``parameters``."""
         return changed(self.air, parameters)
 
+    def warm(self) -> None:
+        """Solve what the page shows first, with a sun more on either side, before it asks."""
+        altitudes, suns = self._tables({}).cells(START["altitude_m"], np.radians(START["sun_zenith_deg"]))
+        self._tables({}).fill((altitudes, slice(max(suns.start - 1, 0), min(suns.stop + 1, SUNS))))
+
     def texels(self, parameters: Any, altitudes: Any, suns: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
         """Description and float32 arrays of one block: transmittance [64, 256, 3], irradiance [16, 64, 3];
         transmittance to the ground of the rows that end there [A, rows / 2, 3], scattering and single_mie [A, rows,
         angles, S, 3]; A and S are the ranges ``altitudes`` and ``suns``, [first, end]."""
         block = (_range(altitudes, "altitudes", ALTITUDES), _range(suns, "suns", SUNS))
         tables = self._tables(parameters)
-        seconds = tables.fill(block)
+        tables.fill(block)
         about = {
             "altitudes": [block[0].start, block[0].stop],
             "suns": [block[1].start, block[1].stop],
             "g": tables.one.g,
             "ground_albedo": _albedo(tables.air, tables.colours).tolist(),
             "solve_s": tables.solve_s,
-            "bake_s": seconds,
+            "bake_s": tables.bake_s,
             "warnings": self.warnings,
         }
         found = tables.found
@@ -128,13 +144,14 @@ class _Tables:
         self.known = np.zeros((ALTITUDES, SUNS), dtype=bool)
         self.to_ground = np.zeros((ALTITUDES, SCATTERING[1] // 2, 3), dtype=np.float32)
         self.found: ClientTables | None = None
+        self.bake_s = 0.0
         self._whole: dict[str, Any] | None = None
 
-    def fill(self, block: tuple[slice, slice]) -> float:
-        """Bake what is missing of a block; seconds that it took."""
-        start = time.perf_counter()
+    def fill(self, block: Block) -> None:
+        """Bake a block, unless all of it is there; ``bake_s``: seconds that the last one took."""
         if self.known[block].all():
-            return 0.0
+            return
+        start = time.perf_counter()
         part = client_tables(self.sky, self.colours, self.one, MU_S_MIN, SCATTERING, block)
         if self.found is None:
             whole = [np.zeros((*SCATTERING, 3), dtype=np.float32) for _ in range(2)]
@@ -144,7 +161,7 @@ class _Tables:
         self.found.single_mie[block[0], :, :, block[1]] = part.single_mie
         self.to_ground[block[0]] = self._transmittance_to_ground(block[0])
         self.known[block] = True
-        return time.perf_counter() - start
+        self.bake_s = time.perf_counter() - start
 
     def _transmittance_to_ground(self, altitudes: slice) -> np.ndarray:
         h, mu, ground = view_rows(self.to, *SCATTERING[:2], altitudes)
@@ -159,13 +176,16 @@ class _Tables:
     def error(self, altitude: float, sun: float) -> dict[str, Any]:
         if self._whole is None and self.known.all():
             self._whole = table_error(self.found, self.sky, self.colours)
+        known = self.known[self.cells(altitude, sun)].all()
+        return {"view": self._view_error(altitude, sun) if known else None, "whole": self._whole}
+
+    def cells(self, altitude: float, sun: float) -> Block:
+        """Altitudes and suns (rad) that a view reads; from space it sees all suns."""
         thickness = self.air.thickness_m
-        # Altitudes and suns that the view reads; from space it sees all suns.
         i = np.clip(self.to.transmittance(min(altitude, thickness), 1.0)[0] * (ALTITUDES - 1), 0, ALTITUDES - 1)
         k = np.clip(self.to.sun(np.cos(sun)) * (SUNS - 1), 0, SUNS - 1)
-        suns = slice(None) if altitude > thickness else slice(int(k), int(np.ceil(k)) + 1)
-        known = self.known[int(i) : int(np.ceil(i)) + 1, suns].all()
-        return {"view": self._view_error(altitude, sun) if known else None, "whole": self._whole}
+        suns = slice(0, SUNS) if altitude > thickness else slice(int(k), int(np.ceil(k)) + 1)
+        return slice(int(i), int(np.ceil(i)) + 1), suns
 
     def _view_error(self, altitude: float, sun: float) -> dict[str, Any]:
         rng = np.random.default_rng(0)

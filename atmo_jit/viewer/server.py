@@ -51,6 +51,7 @@ class Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, make: Callable[[], Any], port: int = 0) -> None:
+        self._solver = ThreadPoolExecutor(max_workers=1)
         try:
             super().__init__((HOST, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -58,12 +59,17 @@ class Server(ThreadingHTTPServer):
             raise InputError(f"--port: found {port}; allowed: a port from 0 to 65535 that is free ({reason})") from None
         self.port = self.server_address[1]
         self.page = {f.name: f.read_bytes() for f in (files(__package__) / "page").iterdir()}
-        self._solver = ThreadPoolExecutor(max_workers=1)
         self._live = self._solver.submit(make)
+        self._solver.submit(lambda: self.live.warm())
+
+    @property
+    def live(self) -> Any:
+        """What is served, once it is there."""
+        return self._live.result()
 
     def ask(self, question: Callable[[Any], Any]) -> Any:
         """What ``question(live)`` returns or raises, asked in the thread that solves."""
-        return self._solver.submit(lambda: question(self._live.result())).result()
+        return self._solver.submit(lambda: question(self.live)).result()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that went away is no error."""
@@ -115,9 +121,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _read(self, name: str) -> tuple[str, bytes] | None:
         if name == "state":
-            return _json(self.server.ask(lambda live: live.describe()))
+            return _json(self.server.live.describe())
         if name == "lookup.glsl":
-            return KINDS[".glsl"], self.server.ask(lambda live: live.lookup()).encode()
+            return KINDS[".glsl"], self.server.live.lookup().encode()
         if name in self.server.page:
             return KINDS[Path(name).suffix], self.server.page[name]
         return None
@@ -145,7 +151,7 @@ class _Handler(BaseHTTPRequestHandler):
             return "application/octet-stream", self.server.ask(lambda live: framed(*live.texels(*values)))
         if name == "error":
             return _json(self.server.ask(lambda live: live.error(*values)))
-        return _json(self.server.ask(lambda live: live.atmosphere(*values).to_dict()), indent=2)
+        return _json(self.server.live.atmosphere(*values).to_dict(), indent=2)
 
     def _body(self, kind: str, limit: int) -> bytes:
         """The request's body. A page of another site cannot send these kinds without being allowed to."""

@@ -7,11 +7,8 @@ export const LIMITS = {
 };
 
 export class View {
-    constructor() {
-        Object.assign(this, {
-            sun_zenith_deg: 75, sun_azimuth_deg: 180, altitude_m: 500,
-            yaw_deg: 170, pitch_deg: 12, fov_deg: 70, stops: 0,
-        });
+    constructor(start) {
+        Object.assign(this, start);
     }
 
     /** Set a value, kept within its limits; azimuths go round. */

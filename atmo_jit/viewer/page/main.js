@@ -10,15 +10,14 @@ const STILL_MS = 200, SLOW_MS = 50, COARSEST = 4;  // a moving picture slower th
 const AEROSOL = "mie.scattering_per_m", ASYMMETRY = "mie.phase.g", OZONE = "ozone.absorption_per_m";
 const ALBEDO = "ground_albedo";
 
-const view = new View();
 const sliders = {};
-let state, renderer, tables, exposure = 1, coarse = 1, frames = [], pending = false, timer = 0, began = 0, first = true;
+let state, view, renderer, tables, exposure = 1, coarse = 1, frames = [], pending = false, timer = 0, began = 0, first = true;
 
 const degrees = (x) => `${x.toFixed(1)}\u00b0`;
 const metres = (x) => (x < 1000 ? `${x.toFixed(0)} m` : `${(x / 1000).toPrecision(3).replace(/e.*/, "")} km`);
 const kilometres = (x) => (x < 1e6 ? metres(x) : `${Math.round(x / 1000)} km`);
-const percent = (x) => `${(100 * x).toPrecision(2)} %`;
-const milliseconds = (s) => `${Math.round(1000 * s)} ms`;
+const percent = (x) => `${(100 * x).toPrecision(2)}\u00a0%`;
+const milliseconds = (s) => `${Math.round(1000 * s)}\u00a0ms`;
 
 /** A labelled slider. `to` and `from` turn its value into the slider's place and back. */
 function slider(parent, {id, label, low, high, step, value, text, to = (x) => x, from = (x) => x}, moved) {
@@ -300,6 +299,7 @@ async function start() {
     const names = ["state", "lookup.glsl", "sky.glsl", "display.glsl"];
     const [described, lookup, sky, display] = await Promise.all(names.map(text));
     state = JSON.parse(described);
+    view = new View(state.start);
     byId("name").textContent = `Sky of ${state.name}`;
     byId("warnings").textContent = state.warnings.join(" ");
     resize();
