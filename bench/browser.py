@@ -11,6 +11,7 @@ WebGL2 runs in software (SwiftShader).
 from __future__ import annotations
 
 import base64
+import fcntl
 import json
 import os
 import select
@@ -60,16 +61,17 @@ class Browser:
         program = next(filter(None, map(shutil.which, PROGRAMS)))
         ours, theirs = os.pipe(), os.pipe()
         size = f"--window-size={self.size[0]},{self.size[1]}"
-        # The pipes have to be the file descriptors 3 and 4 there.
-        shell = f'exec "$@" 3<&{ours[0]} 4>&{theirs[1]}'
+        # They have to be the file descriptors 3 and 4 there; copies above those cannot be in the way.
+        given = [fcntl.fcntl(fd, fcntl.F_DUPFD, 10) for fd in (ours[0], theirs[1])]
+        shell = f'exec "$@" 3<&{given[0]} 4>&{given[1]}'
         self.process = subprocess.Popen(
-            ["sh", "-c", shell, "sh", program, *FLAGS, size, f"--user-data-dir={self.profile.name}", "about:blank"],
-            pass_fds=(ours[0], theirs[1]),
+            ["bash", "-c", shell, "bash", program, *FLAGS, size, f"--user-data-dir={self.profile.name}", "about:blank"],
+            pass_fds=given,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        os.close(ours[0])
-        os.close(theirs[1])
+        for fd in (ours[0], theirs[1], *given):
+            os.close(fd)
         self._write, self._read = ours[1], theirs[0]
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -160,7 +162,7 @@ class Browser:
         if len(name) == 1:
             about |= {"text": name, "code": ""}
         else:
-            about |= {"windowsVirtualKeyCode": KEY_CODES[name]}
+            about |= {"windowsVirtualKeyCode": KEY_CODES[name]} | ({"text": "\r"} if name == "Enter" else {})
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, **about)
 
