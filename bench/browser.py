@@ -32,7 +32,6 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
-    "--remote-debugging-pipe",
 )
 KEY_CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Tab": 9, "PageUp": 33, "PageDown": 34}
 KEY_CODES |= {"Home": 36, "End": 35, "Enter": 13}
@@ -61,11 +60,12 @@ class Browser:
         program = next(filter(None, map(shutil.which, PROGRAMS)))
         ours, theirs = os.pipe(), os.pipe()
         size = f"--window-size={self.size[0]},{self.size[1]}"
+        own = ("--remote-debugging-pipe", size, f"--user-data-dir={self.profile.name}")
         # They have to be the file descriptors 3 and 4 there; copies above those cannot be in the way.
         given = [fcntl.fcntl(fd, fcntl.F_DUPFD, 10) for fd in (ours[0], theirs[1])]
         shell = f'exec "$@" 3<&{given[0]} 4>&{given[1]}'
         self.process = subprocess.Popen(
-            ["bash", "-c", shell, "bash", program, *FLAGS, size, f"--user-data-dir={self.profile.name}", "about:blank"],
+            ["bash", "-c", shell, "bash", program, *FLAGS, *own, "about:blank"],
             pass_fds=given,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

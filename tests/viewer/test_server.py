@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import http.client
 import json
+import signal
+import subprocess
+import sys
 import threading
 from contextlib import contextmanager
 
@@ -192,3 +195,12 @@ def test_what_the_tables_cannot_show_is_refused(tmp_path, capsys):
     assert "sun_angular_radius_deg: found 30" in capsys.readouterr().err
     with pytest.raises(InputError, match="no constituents"):
         Live(Atmosphere({"wavelengths_nm": [550], "bottom_radius_m": 1e6, "top_radius_m": 1.1e6}), "empty")
+
+
+def test_an_interrupt_ends_it_without_a_word():
+    command = [sys.executable, "-m", "atmo_jit", "view", "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith("http://127.0.0.1:")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+        assert not process.stderr.read()

@@ -140,9 +140,11 @@ const events = {
         byId("seconds").textContent = `${milliseconds(about.solve_s)}, ${milliseconds(about.bake_s)}`;
         byId("view-error").textContent = "...";
         byId("whole-error").textContent = "";
-        if (!tables.has(tables.needs(view)) && about.began === began) return;
+        // While a slider moves on, the sky of its last place but one is shown rather than none.
+        const moved = about.began !== undefined && about.began !== began;
+        if (!moved && !tables.has(tables.needs(view))) return;
         paint(performance.now());
-        if (about.began !== undefined && about.began !== began) {
+        if (moved) {
             began = about.began;
             renderer.finish();
             const wait = performance.now() - began;
@@ -215,6 +217,7 @@ function listen() {
         for (const [name, value] of Object.entries(state.controls)) sliders[name].show(value);
         tables.change({});
     });
+    canvas.addEventListener("webglcontextlost", () => showError(new Error("The picture is lost: reload the page.")));
     byId("panel").addEventListener("submit", (event) => event.preventDefault());
 
     const pointers = new Map();

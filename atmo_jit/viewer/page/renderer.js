@@ -33,7 +33,9 @@ export class Renderer {
     constructor(canvas, state, sources) {
         const gl = canvas.getContext("webgl2", {antialias: false, alpha: false, preserveDrawingBuffer: true});
         if (!gl) throw new Error("This browser has no WebGL2, which the picture needs.");
-        if (!gl.getExtension("EXT_color_buffer_float")) throw new Error("This browser cannot draw to float pictures.");
+        if (gl.getExtension("EXT_color_buffer_float")) this.floats = gl.RGBA32F;
+        else if (gl.getExtension("EXT_color_buffer_half_float")) this.floats = gl.RGBA16F;
+        else throw new Error("This browser cannot draw to float pictures.");
         // Where float texels cannot be read linearly, half ones can.
         this.format = gl.getExtension("OES_texture_float_linear") ? gl.RGB32F : gl.RGB16F;
         this.gl = gl;
@@ -138,7 +140,7 @@ export class Renderer {
         }
         const texture = gl.createTexture(), buffer = gl.createFramebuffer();
         gl.bindTexture(gl.TEXTURE_2D, texture);
-        gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, width, height);
+        gl.texStorage2D(gl.TEXTURE_2D, 1, this.floats, width, height);
         for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
             gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
         }

@@ -12,8 +12,7 @@ function unframed(buffer) {
 
 /** A JSON object and float32 numbers in one body. */
 export function framed(about, numbers) {
-    let text = JSON.stringify(about);
-    let bytes = new TextEncoder().encode(text);
+    const bytes = new TextEncoder().encode(JSON.stringify(about));
     const padded = new Uint8Array(Math.ceil(bytes.length / 4) * 4).fill(32);
     padded.set(bytes);
     return new Blob([new Uint32Array([padded.length]), padded, numbers]);
@@ -21,7 +20,9 @@ export function framed(about, numbers) {
 
 /** POST JSON; the answer, or an Error with the server's line. */
 export async function ask(name, body, kind = "application/json") {
-    const answer = await fetch(name, {method: "POST", headers: {"Content-Type": kind}, body});
+    const answer = await fetch(name, {method: "POST", headers: {"Content-Type": kind}, body}).catch(() => {
+        throw new Error("The server does not answer: is atmo-jit view still running?");
+    });
     if (!answer.ok) {
         const found = await answer.json().catch(() => ({}));
         throw new Error(found.error || `${name}: ${answer.status} ${answer.statusText}`);
