@@ -18,13 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from atmo_jit.errors import InputError
+from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
 from .observations import Observations
 from .optimise import STEP_TOLERANCE, Residuals, Solution, minimise
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
-from .wavelengths import at_wavelengths
 
 FEW = 300  # samples (directions) that the first steps look at
 UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
