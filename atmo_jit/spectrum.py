@@ -103,8 +103,8 @@ def adaptation(source: Any, target: Any) -> np.ndarray:
 def xyz_to_rgb(space: str) -> np.ndarray:
     """The [3, 3] matrix from CIE XYZ to linear ``srgb``, ``rec2020`` or ``acescg``.
 
-    XYZ are under D65, the white of the first two; ACEScg has a white of its own, to which they are adapted, so that what
-    is grey in one space is grey in all. Raises InputError for another name.
+    XYZ are under D65, the white of the first two; ACEScg has a white of its own, to which they are adapted, so that
+    what is grey in one space is grey in all. Raises InputError for another name.
     """
     if space == "srgb":
         return xyz_to_srgb()
