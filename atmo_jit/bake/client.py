@@ -26,6 +26,8 @@ from .sunlight import Sunlight
 TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
 SCATTERING = (32, 128, 8, 32)  # altitudes, view cosines, scattering angles, sun cosines
+Block = tuple[slice, slice]  # of altitudes and of suns
+WHOLE: Block = (slice(None), slice(None))
 # Quadrature nodes per piece of a ray, for suns above and below a cosine: what keeps 99 % of all texels within 0.3 %.
 TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 12
 
@@ -69,8 +71,11 @@ def bruneton_tables(
     mu_s_min: float = -0.5,
     size: tuple[int, int, int, int] = SCATTERING,
     mie_weight: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    block: Block = WHOLE,
 ) -> BrunetonTables:
     """The tables of a solved sky, for suns down to the cosine ``mu_s_min``.
+
+    ``block``: of the scattering tables only these altitudes and suns; their texels are those of the whole.
 
     ``mie_weight(species, nu)`` [..., W]: a factor to single scattering by an aerosol species, for clients that multiply
     the sum by a phase function that is not its own.
@@ -83,7 +88,7 @@ def bruneton_tables(
     h, mu_s = to.irradiance_inverse(*np.meshgrid(*map(texels, IRRADIANCE), indexing="ij"))
     _, diffuse = sky.irradiance(h.ravel(), np.arccos(mu_s).ravel())
     irradiance = np.stack([e.numpy() for e in diffuse], axis=-1).reshape(*IRRADIANCE, -1)
-    parts = [_scattering(band, to, size, mie_weight) for band in sky.bands]
+    parts = [_scattering(band, to, size, mie_weight, block) for band in sky.bands]
     return BrunetonTables(
         to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
     )
@@ -106,42 +111,51 @@ def transmittance_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[np.ndar
     return [v.numpy() for v in through]
 
 
-def scattering_nodes(to: Bruneton, size: tuple[int, int, int, int]) -> tuple[np.ndarray, ...]:
+def scattering_nodes(
+    to: Bruneton, size: tuple[int, int, int, int], block: Block = WHOLE
+) -> tuple[np.ndarray, ...]:
     """h, mu, mu_s, nu of the scattering table's texels, [altitude, row, angle, sun] or broadcasting to it."""
     altitudes, rows, angles, suns = size
-    h, mu, _ = _views(to, altitudes, rows)
-    mu_s = to.sun_inverse(texels(suns))
+    h, mu, _ = view_rows(to, altitudes, rows, block[0])
+    mu_s = to.sun_inverse(texels(suns))[block[1]]
     nu = to.angle_inverse(texels(angles)[:, None], mu[..., None, None], mu_s)
     return h[:, None, None, None], mu[..., None, None], mu_s, nu
 
 
-def _views(to: Bruneton, altitudes: int, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """h [altitude], mu [altitude, row] and whether the row's rays meet the ground [row]."""
-    h, _ = to.transmittance_inverse(texels(altitudes), np.zeros(altitudes))
+def view_rows(
+    to: Bruneton, altitudes: int, rows: int, some: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """h [altitude], mu [altitude, row] and whether the row's rays meet the ground [row], of ``some`` of the altitudes
+    of a scattering table."""
+    h, _ = to.transmittance_inverse(texels(altitudes)[some], np.zeros(len(range(altitudes)[some])))
     x = texels(rows // 2)
     ground = np.arange(rows) < rows // 2
     place = np.concatenate([x[::-1], x])
-    return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (altitudes, rows))), ground
+    return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (len(h), rows))), ground
 
 
 def _scattering(
-    band: Any, to: Bruneton, size: tuple[int, int, int, int], mie_weight: Callable[[int, np.ndarray], np.ndarray] | None
+    band: Any,
+    to: Bruneton,
+    size: tuple[int, int, int, int],
+    mie_weight: Callable[[int, np.ndarray], np.ndarray] | None,
+    block: Block,
 ) -> list[np.ndarray]:
     """Rayleigh, Mie and higher orders of one band, [altitude, row, angle, sun, C]."""
     altitudes, rows, angles, suns = size
-    views = _views(to, altitudes, rows)
+    views = view_rows(to, altitudes, rows, block[0])
 
     def angle(index: Any, view: Any, cosine: Any) -> Any:
         return to.angle_inverse(types().Float(index) / (angles - 1.0), view, cosine)
 
     weight = None
     if mie_weight is not None:
-        nu = scattering_nodes(to, size)[3]
+        nu = scattering_nodes(to, size, block)[3]
 
         def weight(species: int) -> np.ndarray:
             return mie_weight(species, nu)[..., band.optics.indices].astype(np.float32)
 
-    return scattered_light(band, views, to.sun_inverse(texels(suns)), angle, angles, weight)
+    return scattered_light(band, views, to.sun_inverse(texels(suns))[block[1]], angle, angles, weight)
 
 
 def scattered_light(

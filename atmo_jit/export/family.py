@@ -12,7 +12,7 @@ import numpy as np
 from .. import mapping
 from ..atmosphere import Atmosphere
 from ..backend import doubles
-from ..bake.client import SCATTERING, bruneton_tables, scattering_nodes
+from ..bake.client import SCATTERING, WHOLE, Block, bruneton_tables, scattering_nodes
 from ..bake.error import compare
 from ..errors import InputError
 from ..phase import RayleighPhase
@@ -156,16 +156,22 @@ def _snippets(tables: ClientTables, size: tuple[int, int, int, int]) -> list[Fil
 
 
 def client_tables(
-    sky: Sky, colours: Channels, aerosol: Aerosol, mu_s_min: float, size: tuple[int, int, int, int]
+    sky: Sky,
+    colours: Channels,
+    aerosol: Aerosol,
+    mu_s_min: float,
+    size: tuple[int, int, int, int],
+    block: Block = WHOLE,
 ) -> ClientTables:
-    """Tables of three channels. An aerosol that is not the client's keeps its radiance at the texels."""
+    """Tables of three channels, or a ``block`` of those of scattering. An aerosol that is not the client's keeps its
+    radiance at the texels."""
     air = sky.atmosphere
 
     def weight(species: int, nu: np.ndarray) -> np.ndarray:
         return phase_ratio(air, species, aerosol.g, nu)
 
-    baked = bruneton_tables(sky, mu_s_min, size, None if aerosol.exact else weight)
-    _, _, _, nu = scattering_nodes(baked.mapping, size)
+    baked = bruneton_tables(sky, mu_s_min, size, None if aerosol.exact else weight, block)
+    _, _, _, nu = scattering_nodes(baked.mapping, size, block)
     higher = colours.radiance(baked.higher) / RayleighPhase().value(nu)[..., None].astype(np.float32)
     return ClientTables(
         baked.mapping,

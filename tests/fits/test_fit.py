@@ -143,7 +143,7 @@ def test_intervals_cover_what_is_true():
     """100 skies drawn at random, 64 x 64 fisheye, 1 % noise: both within 1 % and in 90 to 99 of 100 intervals."""
     from bench.fits import coverage
 
-    rows = coverage(100)
+    rows = list(coverage(100))
     for name in TRUTH:
         inside = np.mean([row["inside"][name] for row in rows])
         assert 0.9 <= inside <= 0.99
