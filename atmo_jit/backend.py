@@ -6,7 +6,8 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
@@ -105,11 +106,6 @@ def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]
     return [values[i] for i in range(count)]
 
 
-def channels(values: Sequence[Any]) -> list[Any]:
-    """A list of opaque parameters, one per entry."""
-    return [parameter(v) for v in values]
-
-
 def padded(channel_count: int) -> int:
     """Floats stored per entry of a table: a packet load wants a power of two."""
     return 4 if channel_count == 3 else channel_count
@@ -156,20 +152,12 @@ def table(values: Any) -> Any:
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
-    import drjit as dr
-
-    out = _scattered(values, lane, size)
-    dr.eval(out)
-    return out
+    return evaluated(_scattered(values, lane, size))
 
 
 def tables_of(groups: Sequence[Sequence[Any]], lane: Any) -> list[Any]:
     """Each group of Floats as a table of rows, one per lane, evaluated together: in one kernel."""
-    import drjit as dr
-
-    out = [_scattered(values, lane, row_size(len(values))) for values in groups]
-    dr.eval(out)
-    return out
+    return evaluated([_scattered(values, lane, row_size(len(values))) for values in groups])
 
 
 def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
@@ -180,3 +168,64 @@ def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
     padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
     dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
     return out
+
+
+def evaluated(buffer: Any) -> Any:
+    """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
+
+    Several Floats in a list are evaluated together, in one kernel if they are of one width.
+
+    Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
+    the process ("dirty variable").
+    """
+    import drjit as dr
+
+    if isinstance(buffer, list):
+        dr.eval(buffer)
+        return [evaluated(one) for one in buffer]
+    if dr.grad_enabled(buffer):
+        return dr.custom(_evaluating(), buffer)
+    dr.eval(buffer)
+    return buffer
+
+
+@contextmanager
+def traversing() -> Iterator[None]:
+    """Derivatives are to be propagated through this package's kernels in such a block.
+
+    Dr.Jit 1.5 aborts the process ("dirty variable") where it sums derivatives into copies of a buffer, one per thread,
+    in a kernel with a loop; here it sums into the buffer itself.
+    """
+    import drjit as dr
+
+    threshold = dr.expand_threshold()
+    dr.set_expand_threshold(0)
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(threshold)
+
+
+@lru_cache(maxsize=1)
+def _evaluating() -> type:
+    import drjit as dr
+
+    class Evaluated(dr.CustomOp):
+        def eval(self, buffer: Any) -> Any:
+            dr.eval(buffer)
+            return buffer
+
+        def forward(self) -> None:
+            grad = self.grad_in("buffer")
+            dr.eval(grad)
+            self.set_grad_out(grad)
+
+        def backward(self) -> None:
+            grad = self.grad_out()
+            dr.eval(grad)
+            self.set_grad_in("buffer", grad)
+
+        def name(self) -> str:
+            return "evaluated"
+
+    return Evaluated

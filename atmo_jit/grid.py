@@ -161,7 +161,10 @@ class Grid(Keeper):
     def locate_altitude(self, h: Any) -> tuple[Any, Any]:
         """Index of the level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
-        position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
+        # The slope of a square root at 0 is no slope of the light: on the ground that of a little above is taken.
+        lowest = 4.0 / _FINE**2
+        share = dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)
+        position = dr.sqrt(share + dr.detach(dr.maximum(lowest - share, 0.0))) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
         return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self.level_count)
@@ -173,7 +176,7 @@ class Grid(Keeper):
     def sun_position(self, mu_s: Any) -> Any:
         """Sun coordinate of cos(sun zenith) ``mu_s``: s at node s, clipped to the first and the last."""
         center, width, scale, offset, last = self._sun_map
-        theta = dr.acos(mu_s)
+        theta = dr.safe_acos(mu_s)
         bend = dr.atan((theta - center) / width) + dr.atan(center / width)
         return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta) - offset, 0.0, last)
 

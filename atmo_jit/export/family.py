@@ -59,6 +59,10 @@ def make(
             f"wavelengths_nm: {len(air.wavelengths_nm)} wavelengths are few for colours; ten between 380 and 720 nm "
             "are right within 2 %"
         )
+    if mu_s_min != client.MU_S_MIN:
+        warnings.append(
+            f"mu-s-min: {mu_s_min:g} is not the client's default; without the muSMin of params.json twilight is wrong"
+        )
     if layout == "bruneton" and air.mie and _red_alone_fails(air):
         warnings.append(
             "mie: the demo restores green and blue of single Mie scattering from its red by the ratios of the "
