@@ -83,7 +83,15 @@ def bruneton_tables(
     air = sky.atmosphere
     to = Bruneton(air.bottom_radius_m, air.top_radius_m, mu_s_min)
     h, mu = to.transmittance_inverse(*np.meshgrid(*map(texels, TRANSMITTANCE), indexing="ij"))
-    through = [v for band in sky.bands for v in transmittance_up(band.optics, h.ravel(), mu.ravel())]
+    through = []
+    for band in sky.bands:
+
+        def columns(optics: Any = band.optics) -> list[Any]:
+            return columns_up(optics, h.ravel(), mu.ravel())
+
+        # The same for all atmospheres with these profiles.
+        kept = band.field.grid.kept("columns of the transmittance texels", columns)
+        through += transmittance_up(band.optics, h.ravel(), mu.ravel(), kept)
     transmittance = np.stack(through, axis=-1).reshape(*TRANSMITTANCE, -1)
     h, mu_s = to.irradiance_inverse(*np.meshgrid(*map(texels, IRRADIANCE), indexing="ij"))
     _, diffuse = sky.irradiance(h.ravel(), np.arccos(mu_s).ravel())
@@ -94,19 +102,27 @@ def bruneton_tables(
     )
 
 
-def transmittance_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[np.ndarray]:
-    """Transmittance to the top per channel, by quadrature, of rays that miss the ground: those that fall pass their
+def columns_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[Any]:
+    """Columns (m) to the top per constituent, by quadrature, of rays that miss the ground: those that fall pass their
     perigee and rise again."""
-    if not optics.constituents:
-        return [np.ones(len(h), dtype=np.float32)] * optics.channel_count
     lowest = np.maximum(
         h - (optics.atmosphere.bottom_radius_m + h) * mu * mu / (1.0 + np.sqrt((1 - mu) * (1 + mu))), 0.0
     )
     columns = column_up(optics, floats(h), floats(np.abs(mu)))
     whole = column_up(optics, floats(lowest), dr.zeros(types().Float, len(h)))
     falls = floats(mu) < 0.0
-    depths = optics.optical_depths([dr.select(falls, 2.0 * w - c, c) for w, c in zip(whole, columns, strict=True)])
-    through = [dr.exp(-d) for d in depths]
+    found = [dr.select(falls, 2.0 * w - c, c) for w, c in zip(whole, columns, strict=True)]
+    dr.eval(found)
+    return found
+
+
+def transmittance_up(
+    optics: Any, h: np.ndarray, mu: np.ndarray, columns: list[Any] | None = None
+) -> list[np.ndarray]:
+    """Transmittance to the top per channel, of the rays of :func:`columns_up`, or with ``columns`` from there."""
+    if not optics.constituents:
+        return [np.ones(len(h), dtype=np.float32)] * optics.channel_count
+    through = [dr.exp(-d) for d in optics.optical_depths(columns or columns_up(optics, h, mu))]
     dr.eval(through)
     return [v.numpy() for v in through]
 

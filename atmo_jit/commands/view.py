@@ -35,12 +35,12 @@ def command(atmosphere: str, port: int, tolerance: float, no_browser: bool) -> N
 
         return Live(air, atmosphere, tolerance)
 
-    with Server(make, port) as server:
-        address = f"http://{HOST}:{server.port}/"
-        click.echo(f"{address} (Ctrl-C ends it)")
-        if not no_browser:
-            webbrowser.open(address)
-        try:
+    try:
+        with Server(make, port) as server:
+            address = f"http://{HOST}:{server.port}/"
+            click.echo(f"{address} (Ctrl-C ends it)")
+            if not no_browser:
+                webbrowser.open(address)
             server.serve_forever(poll_interval=0.05)
-        except KeyboardInterrupt:
-            click.echo("")
+    except KeyboardInterrupt:  # how it is meant to end
+        click.echo("")

@@ -6,12 +6,12 @@ import {Tables, ask, framed} from "./tables.js";
 
 const byId = (id) => document.getElementById(id);
 const canvas = byId("picture");
-const STILL_MS = 200, SLOW_MS = 50, COARSEST = 4;  // a moving picture slower than SLOW_MS is drawn coarser
+const STILL_MS = 200, SLOW_MS = 50, COARSEST = 4;  // a moving picture slower than that is drawn coarser
 const AEROSOL = "mie.scattering_per_m", ASYMMETRY = "mie.phase.g", OZONE = "ozone.absorption_per_m";
 const ALBEDO = "ground_albedo";
 
 const sliders = {};
-let state, view, renderer, tables, exposure = 1, coarse = 1, frames = [], pending = false, timer = 0, began = 0, first = true;
+let state, view, renderer, tables, exposure = 1, coarse = 1, pending = false, timer = 0, began = 0, first = true;
 
 const degrees = (x) => `${x.toFixed(1)}\u00b0`;
 const metres = (x) => (x < 1000 ? `${x.toFixed(0)} m` : `${(x / 1000).toPrecision(3).replace(/e.*/, "")} km`);
@@ -92,9 +92,9 @@ function look() {
 function request() {
     if (pending) return;
     pending = true;
-    requestAnimationFrame((now) => {
+    requestAnimationFrame(() => {
         pending = false;
-        if (tables.has(tables.needs(view))) paint(now);
+        if (tables.has(tables.needs(view))) paint();
     });
 }
 
@@ -102,23 +102,16 @@ function size(scale) {
     return [Math.max(1, Math.round(canvas.width / scale)), Math.max(1, Math.round(canvas.height / scale))];
 }
 
-/** Draw once; coarser while things move too slowly, and once more when they stand still. */
-function paint(now) {
-    const last = frames.at(-1);
-    if (last === undefined || now - last > STILL_MS) frames = [];
-    frames.push(now);
-    if (frames.length > 20) frames.shift();
-    if (frames.length > 3) {
-        const mean = (frames.at(-1) - frames[0]) / (frames.length - 1);
-        byId("frame").textContent = `${mean.toFixed(0)} ms${coarse > 1 ? `, 1/${coarse} size` : ""}`;
-        if (mean > SLOW_MS && coarse < COARSEST) {
-            coarse *= 2;
-            frames = [now];
-        }
-    }
-    draw(coarse);
+/** Draw once: as coarsely as takes SLOW_MS at most while things move, and in full when they stand still. */
+function paint() {
+    const start = performance.now(), scale = coarse;
+    draw(scale);
+    renderer.finish();
+    const ms = performance.now() - start, whole = ms * scale ** 2;
+    byId("frame").textContent = `${ms.toFixed(0)}\u00a0ms${scale > 1 ? ` at 1/${scale} size` : ""}`;
+    coarse = [1, 2, 4].find((c) => whole / c ** 2 <= SLOW_MS) || COARSEST;
     clearTimeout(timer);
-    if (coarse > 1) timer = setTimeout(() => draw(1), STILL_MS);
+    if (scale > 1) timer = setTimeout(() => draw(1), STILL_MS);
 }
 
 function draw(scale) {
@@ -127,7 +120,6 @@ function draw(scale) {
     if (first) {
         first = false;
         byId("progress").hidden = true;
-        renderer.finish();
         document.documentElement.dataset.firstPictureMs = performance.now().toFixed(0);
     }
     return picture;
@@ -143,10 +135,9 @@ const events = {
         // While a slider moves on, the sky of its last place but one is shown rather than none.
         const moved = about.began !== undefined && about.began !== began;
         if (!moved && !tables.has(tables.needs(view))) return;
-        paint(performance.now());
+        paint();
         if (moved) {
             began = about.began;
-            renderer.finish();
             const wait = performance.now() - began;
             byId("latency").textContent = `${wait.toFixed(0)} ms`;
             document.documentElement.dataset.latencyMs = wait.toFixed(1);
