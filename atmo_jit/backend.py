@@ -93,16 +93,17 @@ def parameter(value: Any) -> Any:
     return dr.opaque(t.Float, float(value), 1)
 
 
-def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]:
+def packet(buffer: Any, index: Any, count: int, active: Any = True, *, alone: bool = False) -> list[Any]:
     """``count`` consecutive values of a Float or UInt ``buffer`` from ``index * count`` on, as a list: packet loads
-    where the count is a power of two. Other counts are slow to run, and slower to compile."""
+    where the count is a power of two. Other counts are slow to run, and slower to compile. ``alone``: nothing else
+    reads the buffer; each thread then sums its derivatives for itself."""
     import drjit as dr
 
-    t = types()
+    t, mode = types(), dr.ReduceMode.Expand if alone else dr.ReduceMode.Auto
     one, several = (t.UInt, t.ArrayXu) if isinstance(buffer, t.UInt) else (t.Float, t.ArrayXf)
     if count == 1:
-        return [dr.gather(one, buffer, index, active)]
-    values = dr.gather(several, buffer, index, active, shape=(count, dr.width(index)))
+        return [dr.gather(one, buffer, index, active, mode=mode)]
+    values = dr.gather(several, buffer, index, active, mode=mode, shape=(count, dr.width(index)))
     return [values[i] for i in range(count)]
 
 
@@ -116,11 +117,14 @@ def row_size(count: int) -> int:
     return 1 << (count - 1).bit_length() if count <= 4 else -(-count // 8) * 8
 
 
-def row(buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True) -> list[Any]:
-    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``)."""
+def row(
+    buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True, *, alone: bool = False
+) -> list[Any]:
+    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``); ``alone``: see
+    packet."""
     size = row_size(length or count)
     step = min(size, 8)
-    parts = [packet(buffer, index * (size // step) + i, step, active) for i in range(-(-count // step))]
+    parts = [packet(buffer, index * (size // step) + i, step, active, alone=alone) for i in range(-(-count // step))]
     return [value for part in parts for value in part][:count]
 
 

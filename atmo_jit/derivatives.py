@@ -19,6 +19,7 @@ import numpy as np
 from .atmosphere import Atmosphere
 from .backend import doubles, evaluated, floats, traversing, types
 from .errors import InputError
+from .grid import Grid
 from .optics import Optics, on_device
 from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, per_wavelength, tangent
 from .pieces import Pieces
@@ -52,15 +53,29 @@ class Linearization:
         ground: bool = True,
         sun_disc: bool = False,
         resolution: Resolution | None = None,
+        layout: Atmosphere | None = None,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         self.views = check_views(views)
         self._options = {"ground": ground, "sun_disc": sun_disc}
         self._solving = {"orders": orders, "tolerance": tolerance}
         too = [c.name for c in self.atmosphere.constituents]
-        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, sure=True, scattering_too=too)
+        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, layout=layout, sure=True, scattering_too=too)
         r = self.sky.resolution
         self._degrees, self._phase_degree = r.degrees, r.phase_degree
+
+    def moved(self, parameters: Mapping[str, Any]) -> Linearization:
+        """The linearization where parameters, arrays by name, have other values.
+
+        On the same nodes as long as they suit, so that it changes smoothly with the parameters, as a fit wants it.
+        Raises what Linearization raises, and InputError for an unknown name.
+        """
+        options: dict[str, Any] = {**self._solving, **self._options}
+        there, views = replaced(self.atmosphere, self.views, parameters)
+        needed = Resolution.suited(there, options["tolerance"])
+        if needed.first_degree <= self.sky.resolution.first_degree and Grid.suits(self.sky.layout, there):
+            options |= {"resolution": self.sky.resolution, "layout": self.sky.layout}
+        return Linearization(there, views, **options)
 
     @property
     def rays(self) -> int:
@@ -425,7 +440,14 @@ def moved_to(
     atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
 ) -> Linearization:
     """The linearization where ``parameters``, arrays by name, take the place of the atmosphere's and the views'."""
-    air, views = Atmosphere.load(atmosphere), dict(views)
+    return Linearization(*replaced(Atmosphere.load(atmosphere), views, parameters), **options)
+
+
+def replaced(
+    air: Atmosphere, views: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> tuple[Atmosphere, dict[str, Any]]:
+    """Atmosphere and views with other values of parameters."""
+    views = dict(views)
     changes = {}
     for name in check_names(air, tuple(parameters)):
         value = np.array(parameters[name], dtype=np.float64).ravel()
@@ -435,7 +457,7 @@ def moved_to(
             changes[name] = value.tolist() if len(value) > 1 else np.full(np.shape(described(air, name)), value[0])
         else:
             changes[name] = value.tolist() if len(value) > 1 else float(value[0])
-    return Linearization(air.replace(changes) if changes else air, views, **options)
+    return air.replace(changes) if changes else air, views
 
 
 def shaped(gradient: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

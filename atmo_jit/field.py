@@ -177,7 +177,7 @@ class Field:
 
         def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
             values, state = basis.next(packet(recurrences, i, 4, active), state)
-            corner = [packet(moments, node * stride + i, padded(channels), active) for node in nodes]
+            corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
             moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
             degree = t.UInt(dr.gather(t.Float, degrees, i, active))
             chi = row(phases, degree, kinds * channels, active=active)

@@ -40,15 +40,17 @@ class Samples:
     def __init__(self, grid: Grid, directions: Directions, azimuths: int) -> None:
         t = types()
         self.paths = paths = paths_along(grid, directions, 1)
-        suns, device = grid.shape[1], self.paths.device
+        suns = grid.shape[1]
         lane = dr.arange(t.UInt, len(paths.station) * suns * azimuths)
         azimuth, rest = lane % azimuths, lane // azimuths
         sun, visit = rest % suns, rest // suns
         cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
-        mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.theta)), sun) for f in (np.cos, np.sin))
-        mu0 = dr.gather(t.Float, device.mu_start, dr.gather(t.UInt, device.ray, visit))
-        mu = dr.gather(t.Float, floats(paths.mu[paths.station]), visit)
-        cos_turn, sin_turn = packet(device.turns, visit, 2)
+        mu_s, sin_s = packet(floats(np.column_stack([np.cos(grid.theta), np.sin(grid.theta)])), sun, 2)
+        # One packet per visit: gathers of single numbers take long to compile.
+        of_visit = paths.station
+        turns = paths.cos_turn[of_visit], paths.sin_turn[of_visit]
+        places = floats(np.column_stack([*turns, paths.mu[of_visit], paths.mu_start[paths.ray[of_visit]]]))
+        cos_turn, sin_turn, mu, mu0 = packet(places, visit, 4)
         nu = dr.fma(mu0, mu_s, safe_sine(mu0) * sin_s * cos_phi)
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
         self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
@@ -179,7 +181,7 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
     t = types()
     s = dr.minimum(t.UInt(x), suns - 2)
     taps = cubic(x - t.Float(s))
-    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    corners = [row(table, first + s + n, orders * channels, alone=True) for n in range(4)]
     cos_m, cos_before = 1.0, cos_phi
     total = [0.0] * channels
     for m in range(orders):
@@ -204,7 +206,9 @@ def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int,
     size = dr.opaque(t.UInt, rows, 1)
 
     def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        weight, value = (row(table, place * size + l_, width) for table, place in ((weights, visit), (moments, node)))
+        weight, value = (
+            row(table, place * size + l_, width, alone=True) for table, place in ((weights, visit), (moments, node))
+        )
         return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums, strict=True)]
 
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]

@@ -21,6 +21,8 @@ from .profile import Tabulated
 from .resolution import Resolution, column_of
 
 _FINE = 2048
+_PLANET = ("bottom_radius_m", "top_radius_m", "sun_angular_radius_deg")
+NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
@@ -56,6 +58,18 @@ class Grid(Keeper):
         while len(cls._known) > REMEMBERED:
             cls._known.popitem(last=False)
         return cls._known[key]
+
+    @staticmethod
+    def suits(nodes: Atmosphere, atmosphere: Atmosphere) -> bool:
+        """Whether the grid for ``nodes`` serves another atmosphere too: one with the same profiles and planet, whose
+        optical depths are not far from its own."""
+        own, others = nodes.constituents, atmosphere.constituents
+        same = all(getattr(nodes, name) == getattr(atmosphere, name) for name in _PLANET) and len(own) == len(others)
+        return same and all(
+            profile_key(a.profile) == profile_key(b.profile)
+            and abs(_matter(nodes, a)[1] - _matter(atmosphere, b)[1]) <= NEAR
+            for a, b in zip(own, others, strict=True)
+        )
 
     def __init__(
         self, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None

@@ -187,7 +187,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
             x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
             cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
             f = x - t.Float(cell)
-            low, high = row(phases, cell, width), row(phases, cell + 1, width)
+            low, high = (row(phases, cell + i, width, alone=True) for i in (0, 1))
             for i, part in enumerate(held):
                 glow = dr.maximum(_dot(taps, part), 0.0)
                 values[i % channels] = dr.fma(glow, dr.fma(f, high[i] - low[i], low[i]), values[i % channels])

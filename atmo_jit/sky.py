@@ -93,7 +93,7 @@ class Sky:
         sure: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
-        self._layout = layout or self.atmosphere
+        self.layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
@@ -118,7 +118,7 @@ class Sky:
     @property
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
-        return Grid.of(self._layout, self.resolution, self.suns)
+        return Grid.of(self.layout, self.resolution, self.suns)
 
     def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
         """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``

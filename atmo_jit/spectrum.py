@@ -36,7 +36,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["SpectralBasis", "cie_1931", "interpolation_weights", "solar_irradiance", "xyz_to_srgb"]
+from .errors import InputError
+
+__all__ = ["SpectralBasis", "cie_1931", "interpolation_weights", "solar_irradiance", "xyz_to_rgb", "xyz_to_srgb"]
 
 VISIBLE_NM = (360.0, 830.0)  # Mitsuba's range of wavelengths, and that of the colour matching functions
 SMOOTHING_NM = 10  # below this the Fraunhofer lines would make single wavelengths bad anchors of the spectrum
@@ -61,6 +63,47 @@ def cie_1931() -> tuple[np.ndarray, np.ndarray]:
 def xyz_to_srgb() -> np.ndarray:
     """The [3, 3] matrix from CIE XYZ to linear sRGB (IEC 61966-2-1)."""
     return _frozen(_data()["xyz_to_srgb"])
+
+
+WHITES = {"D65": (0.3127, 0.3290), "ACES": (0.32168, 0.33767)}
+# xy of red, green, blue, and the white: ITU-R BT.2020-2, table 3; ACES, S-2014-004.
+RGB_SPACES = {
+    "rec2020": (((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)), "D65"),
+    "acescg": (((0.713, 0.293), (0.165, 0.830), (0.128, 0.044)), "ACES"),
+}
+# Cone responses of Lam 1985, known as Bradford's.
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+
+def white_xyz(xy: tuple[float, float]) -> np.ndarray:
+    """XYZ [3] of luminance 1 with the chromaticity xy."""
+    x, y = xy
+    return np.array([x / y, 1.0, (1.0 - x - y) / y])
+
+
+def adaptation(source: Any, target: Any) -> np.ndarray:
+    """[3, 3]: XYZ of a colour under the white ``source`` to those of the corresponding colour under ``target`` (both
+    XYZ [3]), by von Kries' rule with Bradford's cones; a white of any luminance keeps it."""
+    source, target = (np.asarray(w, float) / w[1] for w in (source, target))
+    gain = (_BRADFORD @ target) / (_BRADFORD @ source)
+    return np.linalg.solve(_BRADFORD, gain[:, None] * _BRADFORD)
+
+
+@cache
+def xyz_to_rgb(space: str) -> np.ndarray:
+    """The [3, 3] matrix from CIE XYZ to linear ``srgb``, ``rec2020`` or ``acescg``.
+
+    XYZ are under D65, the white of the first two; ACEScg has a white of its own, to which they are adapted, so that
+    what is grey in one space is grey in all. Raises InputError for another name.
+    """
+    if space == "srgb":
+        return xyz_to_srgb()
+    if space not in RGB_SPACES:
+        raise InputError(f"space: is {space!r}; must be one of srgb, {', '.join(RGB_SPACES)}")
+    primaries, white = RGB_SPACES[space]
+    columns = np.stack([white_xyz(xy) for xy in primaries], axis=-1)
+    to_xyz = columns * np.linalg.solve(columns, white_xyz(WHITES[white]))
+    return _frozen(np.linalg.inv(to_xyz) @ adaptation(white_xyz(WHITES["D65"]), white_xyz(WHITES[white])))
 
 
 @cache
@@ -153,14 +196,29 @@ class SpectralBasis:
         nm, functions = cie_1931()
         return functions.T @ self.matrix(nm) / functions[:, 1].sum()
 
+    def rgb_matrix(self, space: str = "srgb", white: Any = None) -> np.ndarray:
+        """[3, W]: linear colours (``srgb``, ``rec2020``, ``acescg``) of a radiance, normalised as in Mitsuba.
+
+        Saturated light can be negative in a channel. ``white``: light [W] that shall look white, the sunlight at noon
+        for instance; None: no white balance, D65 is white. Raises InputError for another space.
+        """
+        xyz = self.xyz_matrix
+        if white is not None:
+            xyz = adaptation(xyz @ np.asarray(white, dtype=np.float64), white_xyz(WHITES["D65"])) @ xyz
+        return xyz_to_rgb(space) @ xyz
+
     @property
     def srgb_matrix(self) -> np.ndarray:
-        """[3, W]: linear sRGB of a radiance, normalised as in Mitsuba. Saturated light can be negative in a channel."""
-        return xyz_to_srgb() @ self.xyz_matrix
+        """[3, W]: linear sRGB of a radiance (:meth:`rgb_matrix`)."""
+        return self.rgb_matrix()
 
     def to_srgb(self, radiance: Any) -> np.ndarray:
         """Linear sRGB [..., 3] of radiance [..., W]."""
-        return np.asarray(radiance, dtype=np.float64) @ self.srgb_matrix.T
+        return self.to_rgb(radiance)
+
+    def to_rgb(self, radiance: Any, space: str = "srgb", white: Any = None) -> np.ndarray:
+        """Linear colours [..., 3] of radiance [..., W] (:meth:`rgb_matrix`)."""
+        return np.asarray(radiance, dtype=np.float64) @ self.rgb_matrix(space, white).T
 
 
 def _frozen(values: Any) -> np.ndarray:

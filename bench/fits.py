@@ -15,7 +15,7 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,9 @@ def _draw(rng: np.random.Generator) -> tuple[float, float, float]:
     return float(np.exp(rng.uniform(np.log(2e-6), np.log(1e-4)))), rng.uniform(0.3, 0.9), rng.uniform(20.0, 85.0)
 
 
-def coverage(count: int, size: int = 64, noise: float = 0.01, seed: int = 1) -> list[dict[str, Any]]:
+def coverage(count: int, size: int = 64, noise: float = 0.01, seed: int = 1) -> Iterator[dict[str, Any]]:
     """Fits of ``count`` skies: of each the truth, relative errors and whether the 95 % intervals hold the truth."""
-    rng, rows = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
     for i in range(count):
         scattering, g, sun = _draw(rng)
         report = result(fit(observations(fisheye(scattering, g, sun, size, noise, seed + i)), config(robust=False)))
@@ -68,8 +68,7 @@ def coverage(count: int, size: int = 64, noise: float = 0.01, seed: int = 1) -> 
             entry = report["parameters"][name]
             low, high = entry["interval_95"]
             row["error"][name], row["inside"][name] = entry["value"] / truth - 1.0, low <= truth <= high
-        rows.append(row | {"scattering_per_m": scattering, "g": g, "seconds": report["seconds"]})
-    return rows
+        yield row | {"scattering_per_m": scattering, "g": g, "seconds": report["seconds"]}
 
 
 def recovery() -> None:
@@ -160,7 +159,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("scans"), help="folder of kider")
     given = parser.parse_args(arguments)
     if given.what == "coverage":
-        rows = coverage(given.count)
+        rows = []
+        for row in coverage(given.count):
+            rows.append(row)
+            place = f"{row['scattering_per_m']:.3g} {row['g']:.3f} {row['sun_zenith_deg']:.1f}"
+            off = [f"{100 * row['error'][name]:+.3f} % {'in' if row['inside'][name] else 'out'}" for name in FREE]
+            print(f"{place}: {'  '.join(off)}", flush=True)
         for name in FREE:
             errors = np.abs([row["error"][name] for row in rows])
             inside = np.mean([row["inside"][name] for row in rows])

@@ -19,6 +19,7 @@ import numpy as np
 
 from atmo_jit.errors import InputError
 from atmo_jit.optics import MAX_CHANNELS
+from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
 from .forward import ROUGH
@@ -26,7 +27,6 @@ from .observations import Observations
 from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
-from .wavelengths import at_wavelengths
 
 FEW = 300  # samples (directions) that the first steps look at
 UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected

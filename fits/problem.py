@@ -20,11 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from atmo_jit.wavelengths import at_wavelengths
+
 from .config import FitConfig
 from .forward import SkyModel
 from .observations import Observations
 from .parameters import Leaf, Scalar, leaf_of
-from .wavelengths import at_wavelengths
 
 TURN = np.radians(0.02)  # step of differences by the sun's angles
 HUBER = 1.345  # robust scale at which a Gaussian sample loses 5 % of its worth (Huber 1964)

@@ -190,6 +190,17 @@ def test_derivatives_are_finite_where_geometry_is_singular():
     assert np.all(at.jacobian(["mie.scattering_per_m"])["mie.scattering_per_m"][0] > 0.0)
 
 
+def test_a_fit_moves_smoothly(at):
+    """As long as nodes suit they stay, and the radiance changes as its derivative says; else they are placed anew."""
+    step = at.moved({"mie.scattering_per_m": EARTH.get("mie.scattering_per_m") * 1.3, "mie.phase.g": 0.78})
+    assert step.sky.grid is at.sky.grid
+    far = at.moved({"mie.scattering_per_m": EARTH.get("mie.scattering_per_m") * 10.0})
+    assert far.sky.grid is not at.sky.grid
+    assert far.sky.grid is not at.moved({"rayleigh.scale_height_m": 7000.0}).sky.grid
+    want = Linearization(step.atmosphere, VIEWPOINTS, tolerance=COARSE).value["radiance"]
+    assert step.value["radiance"] == pytest.approx(want, rel=0.02)
+
+
 def test_an_unknown_name_is_refused(at):
     for ask in (lambda: at.jacobian(["mie.foo"]), lambda: at.vjp({}, ["mie.foo"]), lambda: at.jvp({"mie.foo": 1.0})):
         with pytest.raises(InputError, match=r"gradient: 'mie.foo' is no parameter; allowed are solar_irradiance, "):

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from atmo_jit import presets
 from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.earth import earth_at
 
 
 @pytest.mark.parametrize("name", presets.NAMES)
 def test_presets_are_complete(name):
     air = Atmosphere.load(name)
     assert air.to_dict() == presets.read(name)
-    assert air.rayleigh is not None and len(air.mie) == 1
-    assert presets.SOURCES[name]
+    assert len(air.constituents) >= 2 and presets.SOURCES[name]
+
+
+@pytest.mark.parametrize("kind", ["continental", "maritime", "desert", "urban"])
+def test_earths_are_what_their_source_says(kind):
+    air = Atmosphere.load(f"earth_{kind}")
+    made = earth_at(air.wavelengths_nm, kind)
+    for name in made.names():
+        np.testing.assert_allclose(air.get(name), made.get(name), rtol=1e-4, err_msg=name)
+
+
+def test_haze_has_the_optical_depth_it_claims():
+    haze = Atmosphere.load("haze")
+    altitude, density = (haze.get(f"mie.profile.{name}") for name in ("altitude_m", "density"))
+    depth = haze.mie[0].extinction_per_m * np.trapezoid(density, altitude)
+    assert depth[1] == pytest.approx(8.1, rel=1e-3)
+    np.testing.assert_allclose(depth / depth[1], (haze.wavelengths_nm / 550.0) ** -2, rtol=1e-3)
 
 
 def test_earth_is_the_block_of_the_manual():

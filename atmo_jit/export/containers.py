@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,16 +36,18 @@ def write_all(folder: Path, files: Sequence[File]) -> int:
 
     Raises OSError when a file does not read back as it was meant; files that were there before then stay.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"output {str(folder)!r}: cannot be made a folder ({error.strerror})") from None
+    folder.mkdir(parents=True, exist_ok=True)
     with atomic_outputs(*(folder / file.name for file in files)) as parts:
-        for file, part in zip(files, parts, strict=True):
-            file.write(part)
-            if not _same(file.content, file.read(part)):
-                raise OSError(f"{file.name}: does not read back as it was written")
+        with ThreadPoolExecutor() as pool:  # compression leaves Python's lock to others
+            for _ in pool.map(_write_and_check, files, parts):
+                pass
         return sum(part.stat().st_size for part in parts)
+
+
+def _write_and_check(file: File, part: Path) -> None:
+    file.write(part)
+    if not _same(file.content, file.read(part)):
+        raise OSError(f"{file.name}: does not read back as it was written")
 
 
 def _same(a: Any, b: Any) -> bool:

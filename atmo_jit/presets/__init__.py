@@ -6,6 +6,10 @@ import json
 from importlib.resources import files
 from typing import Any
 
+OPAC = (
+    "atmo_jit.earth.earth_at with OPAC's aerosol type {} (Hess et al. 1998, Bull. Am. Meteorol. Soc. 79, 831) at the "
+    "four wavelengths whose colour is nearest to that of the spectrum"
+)
 SOURCES = {
     "earth": (
         "Bruneton 2017, Precomputed Atmospheric Scattering: a New Implementation, at 680, 550 and 440 nm "
@@ -27,6 +31,25 @@ SOURCES = {
         "scattering at 610 Pa and 210 K (Sneep and Ubachs 2005, J. Quant. Spectrosc. Radiat. Transfer 92, 293); "
         "scale height 11 km; "
         "solar irradiance of earth at 1.524 au; ground albedo typical of bright soil"
+    ),
+    "earth_continental": OPAC.format("continental average"),
+    "earth_maritime": OPAC.format("maritime clean"),
+    "earth_desert": OPAC.format("desert"),
+    "earth_urban": OPAC.format("urban"),
+    "boody": (
+        "The constants of Boody's notes, corrected: aerosol absorption 0.444e-6 per metre beside scattering 3.996e-6, "
+        "aerosol density of scale height 1200 m, Rayleigh's phase function; the rest as in earth"
+    ),
+    "boody_as_written": (
+        "The same as written: aerosol absorption 4.40e-6 per metre, aerosol density of the gas's scale height 8000 m, "
+        "and the modified Rayleigh phase function 7/5 + 1/2 cos^2, as Legendre moments of a species (normalised: as "
+        "written it scatters 1.25 times the light that it takes)"
+    ),
+    "haze": (
+        "A thick-haze world, much like Titan: nitrogen at 1.47 bar and 94 K (Rayleigh scattering by its density over "
+        "the Earth's); haze of optical depth 8.1 at 550 nm, evenly dense up to 80 km and of scale height 65 km above, "
+        "falling with wavelength^-2, orange by absorption in the blue (after Tomasko et al. 2008, Planet. Space Sci. "
+        "56, 669, rounded); sunlight at 9.58 au"
     ),
 }
 NAMES = tuple(SOURCES)

@@ -143,8 +143,24 @@ def test_intervals_cover_what_is_true():
     """100 skies drawn at random, 64 x 64 fisheye, 1 % noise: both within 1 % and in 90 to 99 of 100 intervals."""
     from bench.fits import coverage
 
-    rows = coverage(100)
+    rows = list(coverage(100))
     for name in TRUTH:
         inside = np.mean([row["inside"][name] for row in rows])
         assert 0.9 <= inside <= 0.99
         assert max(abs(row["error"][name]) for row in rows) < 0.01
+
+
+@pytest.mark.slow
+def test_a_measured_sky_is_followed(reference):
+    """Kider et al. 2014, 2013-05-27 11:45, flagged samples masked. The ranges are those of the sun photometer at Egbert
+    and of other fits of this scan; the scanner stood some 13 degrees off north."""
+    from bench.fits import CONFIG, scan
+
+    arrays = scan(reference / "kider2014", "2013-05-27___11.45.00")
+    report = result(fit(observations(arrays), FitConfig.load(CONFIG)))
+    assert report["converged"] and report["residual_robust"] <= 0.05
+    assert report["rmse"] <= 7e-3 and report["relative_rms"] <= 0.045
+    assert 0.105 <= report["derived"]["tau_440"] <= 0.145
+    assert 0.58 <= report["derived"]["asymmetry_440"] <= 0.68
+    assert report["nuisance"]["sun_azimuth"]["value"] == pytest.approx(-13.0, abs=1.5)
+    assert any("single_scattering_albedo is not identifiable" in text for text in report["not_identifiable"])

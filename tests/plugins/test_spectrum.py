@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from atmo_jit.spectrum import SpectralBasis, cie_1931, interpolation_weights, solar_irradiance, xyz_to_srgb
+from atmo_jit.errors import InputError
+from atmo_jit.spectrum import (
+    SpectralBasis,
+    cie_1931,
+    interpolation_weights,
+    solar_irradiance,
+    xyz_to_rgb,
+    xyz_to_srgb,
+)
 
 PRESET = np.array([680.0, 550.0, 440.0])
 # Mitsuba tabulates the colour matching functions at 5 nm, colour-science at 1 nm; their sRGB matrices have 6 and 4
@@ -81,3 +91,25 @@ def test_three_wavelengths_against_the_spectrum(reference) -> None:
     ten = np.linspace(400.0, 700.0, 10)
     for spectrum in (sky(1.0), sky(5.0), direct(1.0), direct(10.0)):
         assert np.abs(error(spectrum, ten)).max() < 0.02
+
+
+@pytest.mark.parametrize("space, theirs", [("srgb", "sRGB"), ("rec2020", "ITU-R BT.2020"), ("acescg", "ACEScg")])
+def test_colour_spaces_are_those_of_colour_science(space: str, theirs: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    sky = np.array([0.25, 0.3, 0.62])
+    d65 = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+    found = colour.XYZ_to_RGB(sky, theirs, illuminant=d65, chromatic_adaptation_transform="Bradford")
+    np.testing.assert_allclose(xyz_to_rgb(space) @ sky, found, atol=2e-4)  # their sRGB has four digits
+    with pytest.raises(InputError, match="space: is 'rgb'; must be one of srgb, rec2020, acescg"):
+        xyz_to_rgb("rgb")
+
+
+def test_white_balance_makes_the_named_light_grey() -> None:
+    basis = SpectralBasis.of("earth")
+    sun = basis.solar_irradiance * [0.9, 0.8, 0.6]
+    for space in ("srgb", "rec2020", "acescg"):
+        grey = basis.to_rgb(sun, space, white=sun)
+        np.testing.assert_allclose(grey, basis.xyz_matrix[1] @ sun, rtol=2e-4)
+    assert np.ptp(basis.to_rgb(sun)) > 0.1
