@@ -12,15 +12,15 @@ import time
 from dataclasses import asdict
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from .. import __version__
 from .._fields import Range, number
 from ..atmosphere import Atmosphere
 from ..backend import doubles
-from ..bake.client import IRRADIANCE, SCATTERING, TRANSMITTANCE, Block, view_rows
+from ..bake.client import IRRADIANCE, SCATTERING, TRANSMITTANCE, Block, columns_up, transmittance_up, view_rows
 from ..bake.error import compare
-from ..bake.sightlines import Sightlines
 from ..errors import InputError, shown
 from ..export.colour import Channels, channels
 from ..export.family import client_tables, table_error
@@ -98,9 +98,9 @@ class Live:
         self._tables({}).fill((altitudes, slice(max(suns.start - 1, 0), min(suns.stop + 1, SUNS))))
 
     def texels(self, parameters: Any, altitudes: Any, suns: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Description and float32 arrays of one block: transmittance [64, 256, 3], irradiance [16, 64, 3];
-        transmittance to the ground of the rows that end there [A, rows / 2, 3], scattering and single_mie [A, rows,
-        angles, S, 3]; A and S are the ranges ``altitudes`` and ``suns``, [first, end]."""
+        """Description and float32 arrays of one block: transmittance [64, 256, 3], irradiance [16, 64, 3],
+        transmittance to the ground of the rows that end there [altitudes, rows / 2, 3]; scattering and single_mie [A,
+        rows, angles, S, 3], with A and S the ranges ``altitudes`` and ``suns``, [first, end]."""
         block = (_range(altitudes, "altitudes", ALTITUDES), _range(suns, "suns", SUNS))
         tables = self._tables(parameters)
         tables.fill(block)
@@ -114,7 +114,7 @@ class Live:
             "warnings": self.warnings,
         }
         found = tables.found
-        arrays = [found.transmittance, found.irradiance, tables.to_ground[block[0]]]
+        arrays = [found.transmittance, found.irradiance, tables.to_ground]
         arrays += [found.scattering[block[0], :, :, block[1]], found.single_mie[block[0], :, :, block[1]]]
         return about, arrays
 
@@ -128,22 +128,25 @@ class Live:
     def _tables(self, parameters: Any) -> _Tables:
         air = changed(self.air, parameters)
         if self._last is None or self._last.air != air:
-            self._last = _Tables(air, self.kind, self.tolerance)
+            spare = self._last.found if self._last else None
+            self._last = None  # its arrays are written over
+            self._last = _Tables(air, self.kind, self.tolerance, spare)
         return self._last
 
 
 class _Tables:
     """The solved sky of one atmosphere, and those blocks of its tables that were asked for."""
 
-    def __init__(self, air: Atmosphere, kind: str, tolerance: float) -> None:
+    def __init__(self, air: Atmosphere, kind: str, tolerance: float, spare: ClientTables | None) -> None:
         start = time.perf_counter()
         self.air, self.colours, self.one = air, channels(air, kind), aerosol(air)
         self.sky = Sky(air, tolerance=tolerance)
         self.solve_s = time.perf_counter() - start
         self.to = Bruneton(air.bottom_radius_m, air.top_radius_m, MU_S_MIN)
         self.known = np.zeros((ALTITUDES, SUNS), dtype=bool)
-        self.to_ground = np.zeros((ALTITUDES, SCATTERING[1] // 2, 3), dtype=np.float32)
+        self.to_ground = self._transmittance_to_ground()
         self.found: ClientTables | None = None
+        self._spare = spare
         self.bake_s = 0.0
         self._whole: dict[str, Any] | None = None
 
@@ -154,24 +157,37 @@ class _Tables:
         start = time.perf_counter()
         part = client_tables(self.sky, self.colours, self.one, MU_S_MIN, SCATTERING, block)
         if self.found is None:
-            whole = [np.zeros((*SCATTERING, 3), dtype=np.float32) for _ in range(2)]
+            # To touch new memory takes as long as to solve.
+            if self._spare is None:
+                whole = [np.zeros((*SCATTERING, 3), dtype=np.float32) for _ in range(2)]
+            else:
+                whole = [self._spare.scattering, self._spare.single_mie]
             flat = (v.astype(np.float32) for v in (part.transmittance, part.irradiance))
             self.found = ClientTables(self.to, self.one.g, *flat, *whole)
         self.found.scattering[block[0], :, :, block[1]] = part.scattering
         self.found.single_mie[block[0], :, :, block[1]] = part.single_mie
-        self.to_ground[block[0]] = self._transmittance_to_ground(block[0])
         self.known[block] = True
         self.bake_s = time.perf_counter() - start
 
-    def _transmittance_to_ground(self, altitudes: slice) -> np.ndarray:
-        h, mu, ground = view_rows(self.to, *SCATTERING[:2], altitudes)
-        mu = mu[:, ground]
-        parts = [
-            Sightlines(band.optics, np.repeat(h, mu.shape[1]), mu.ravel(), ground=True, nodes=1).transmittance
-            for band in self.sky.bands
-        ]
-        through = np.concatenate(parts, axis=-1).reshape(*mu.shape, -1)
-        return self.colours.transmittance(through, self.air.solar_irradiance)
+    def _transmittance_to_ground(self) -> np.ndarray:
+        """[altitude, row, 3] of the view rays that end there: what the air holds from the ground up along such a ray,
+        less what it holds from its origin up."""
+        h, mu, ground = view_rows(self.to, *SCATTERING[:2])
+        h, mu = np.broadcast_arrays(h[:, None], mu[:, ground])
+        sine = np.sqrt((1.0 - mu) * (1.0 + mu)) * (1.0 + h / self.to.bottom)
+        there = np.sqrt(np.maximum((1.0 - sine) * (1.0 + sine), 0.0))
+        through = []
+        for band in self.sky.bands:
+
+            def columns(optics: Any = band.optics) -> list[Any]:
+                whole = columns_up(optics, np.zeros(h.size), there.ravel())
+                above = columns_up(optics, h.ravel(), -mu.ravel())
+                return [dr.maximum(w - a, 0.0) for w, a in zip(whole, above, strict=True)]
+
+            kept = band.field.grid.kept("columns to the ground", columns)
+            through += transmittance_up(band.optics, h.ravel(), mu.ravel(), kept)
+        values = np.stack(through, axis=-1).reshape(*h.shape, -1)
+        return self.colours.transmittance(values, self.air.solar_irradiance)
 
     def error(self, altitude: float, sun: float) -> dict[str, Any]:
         if self._whole is None and self.known.all():

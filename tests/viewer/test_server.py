@@ -149,7 +149,7 @@ def test_texels_are_those_of_the_exported_tables(server, earth):
     about, numbers = unframed(body)
     assert status == 200 and about["g"] == 0.8 and about["ground_albedo"] == pytest.approx([0.1] * 3)
     a, rows, angles, s = 1, *SCATTERING[1:3], 2
-    sizes = [64 * 256 * 3, 16 * 64 * 3, a * rows // 2 * 3, *[a * rows * angles * s * 3] * 2]
+    sizes = [64 * 256 * 3, 16 * 64 * 3, SCATTERING[0] * rows // 2 * 3, *[a * rows * angles * s * 3] * 2]
     assert len(numbers) == sum(sizes)
     mie = np.split(numbers, np.cumsum(sizes))[4].reshape(a, rows, angles, s, 3)
     exact = bruneton_tables(earth, block=(slice(*altitudes), slice(*suns)))

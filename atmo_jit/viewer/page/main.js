@@ -23,7 +23,7 @@ const milliseconds = (s) => `${Math.round(1000 * s)}\u00a0ms`;
 function slider(parent, {id, label, low, high, step, value, text, to = (x) => x, from = (x) => x}, moved) {
     const row = document.createElement("div");
     row.className = "row";
-    row.innerHTML = "<label></label><output></output><input type=range>";
+    row.innerHTML = "<label></label><output aria-live=off></output><input type=range>";
     const [name, output, input] = row.children;
     name.textContent = label;
     input.id = name.htmlFor = id;
@@ -104,9 +104,10 @@ function size(scale) {
 
 /** Draw once: as coarsely as takes SLOW_MS at most while things move, and in full when they stand still. */
 function paint() {
-    const start = performance.now(), scale = coarse;
+    const start = performance.now(), scale = coarse, compiles = first;
     draw(scale);
     renderer.finish();
+    if (compiles) return;
     const ms = performance.now() - start, whole = ms * scale ** 2;
     byId("frame").textContent = `${ms.toFixed(0)}\u00a0ms${scale > 1 ? ` at 1/${scale} size` : ""}`;
     coarse = [1, 2, 4].find((c) => whole / c ** 2 <= SLOW_MS) || COARSEST;

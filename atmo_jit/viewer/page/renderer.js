@@ -105,15 +105,12 @@ export class Renderer {
         const [a0, a1] = about.altitudes, [s0, s1] = about.suns;
         let at = 0;
         const take = (count) => numbers.subarray(at, at += count);
-        const flat = (name, y, height) => {
-            const {texture, width} = this.textures[name];
+        for (const name of ["atm_transmittance_texture", "atm_irradiance_texture", "to_ground_texture"]) {
+            const {texture, width, height} = this.textures[name];
             gl.bindTexture(gl.TEXTURE_2D, texture);
             const part = take(3 * width * height);
-            gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RGB, gl.FLOAT, part);
-        };
-        flat("atm_transmittance_texture", 0, state.transmittance[0]);
-        flat("atm_irradiance_texture", 0, state.irradiance[0]);
-        flat("to_ground_texture", a0, a1 - a0);
+            gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGB, gl.FLOAT, part);
+        }
         const few = s1 - s0;
         gl.pixelStorei(gl.UNPACK_ROW_LENGTH, angles * few);
         for (const name of ["atm_scattering_texture", "atm_single_mie_texture"]) {
