@@ -196,12 +196,14 @@ class _Tables:
         return {"view": self._view_error(altitude, sun) if known else None, "whole": self._whole}
 
     def cells(self, altitude: float, sun: float) -> Block:
-        """Altitudes and suns (rad) that a view reads; from space it sees all suns."""
-        thickness = self.air.thickness_m
-        i = np.clip(self.to.transmittance(min(altitude, thickness), 1.0)[0] * (ALTITUDES - 1), 0, ALTITUDES - 1)
-        k = np.clip(self.to.sun(np.cos(sun)) * (SUNS - 1), 0, SUNS - 1)
-        suns = slice(0, SUNS) if altitude > thickness else slice(int(k), int(np.ceil(k)) + 1)
-        return slice(int(i), int(np.ceil(i)) + 1), suns
+        """Altitudes and suns (rad) that a view reads: from space those of all places where rays may enter the air."""
+        top = self.air.top_radius_m
+        place = self.to.transmittance(min(altitude, self.air.thickness_m), 1.0)[0]
+        i = np.clip(place * (ALTITUDES - 1), 0, ALTITUDES - 1)
+        reach = np.arccos(min(top / (self.air.bottom_radius_m + altitude), 1.0))
+        suns = np.clip([sun + reach, sun - reach], 0.0, np.pi)
+        low, high = np.clip(self.to.sun(np.cos(suns)) * (SUNS - 1), 0, SUNS - 1)
+        return slice(int(i), int(np.ceil(i)) + 1), slice(int(low), int(np.ceil(high)) + 1)
 
     def _view_error(self, altitude: float, sun: float) -> dict[str, Any]:
         rng = np.random.default_rng(0)

@@ -169,6 +169,26 @@ def test_blocks_are_parts_of_the_whole(earth):
         np.testing.assert_array_equal(np.broadcast_to(found, expected.shape), expected)
 
 
+@pytest.mark.parametrize("altitude, sun", [(2.0, 60.0), (59e3, 91.0), (400e3, 70.0), (2e7, 5.0)])
+def test_a_view_reads_no_other_texels(server, altitude, sun):
+    """Everything else is made far too bright, and rays all around the observer are drawn."""
+
+    def error(live):
+        tables = live._tables({})
+        block = tables.cells(altitude, np.radians(sun))
+        tables.known[:] = False
+        tables.fill(block)
+        for table in (tables.found.scattering, tables.found.single_mie):
+            kept = table[block[0], :, :, block[1]].copy()
+            table[:] = 1e9
+            table[block[0], :, :, block[1]] = kept
+        assert tables.known.sum() < 0.7 * tables.known.size
+        return live.error({}, altitude, sun)
+
+    found = server.ask(error)
+    assert found["view"]["worst"] < 3.0 and found["whole"] is None
+
+
 @pytest.fixture(scope="module")
 def earth(server):
     """The solved Earth, in the thread where the server solves."""
