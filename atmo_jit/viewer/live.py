@@ -61,6 +61,7 @@ class Live:
         self.kind = "samples" if len(nm) == 3 and nm[0] > nm[1] > nm[2] else "spectral"
         self.warnings = check(air)
         self._last: _Tables | None = None
+        self._parameters: Any = None
 
     def describe(self) -> dict[str, Any]:
         """All that the page needs before it has tables."""
@@ -126,11 +127,11 @@ class Live:
         return self._tables(parameters).error(altitude, sun)
 
     def _tables(self, parameters: Any) -> _Tables:
-        air = changed(self.air, parameters)
-        if self._last is None or self._last.air != air:
+        if self._last is None or self._parameters != parameters:
+            air = changed(self.air, parameters)
             spare = self._last.found if self._last else None
             self._last = None  # its arrays are written over
-            self._last = _Tables(air, self.kind, self.tolerance, spare)
+            self._last, self._parameters = _Tables(air, self.kind, self.tolerance, spare), parameters
         return self._last
 
 
