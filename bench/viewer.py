@@ -87,13 +87,14 @@ def first_picture(browser: Browser) -> tuple[float, float]:
         return time.perf_counter() - start, processor_seconds(usage[0])
 
 
-def latencies(browser: Browser, name: str, process: int) -> list[tuple[float, float]]:
-    """Seconds from a slider's event to the drawn sky, for moves one after another, warm; the server's processor seconds
-    in each."""
+def latencies(browser: Browser, name: str, process: int, jump: bool = False) -> list[tuple[float, float]]:
+    """Seconds from a slider's event to the drawn sky, warm; the server's processor seconds in each. Steps of a
+    hundredth of the slider's length, as of one that is dragged, or jumps over two fifths of it."""
     found = []
     for i in range(MOVES + 3):
         before = processor_seconds(process)
-        browser.evaluate(MOVE.format(name=name, share=0.3 + 0.4 * ((0.618 * i) % 1.0)))
+        share = 0.3 + 0.4 * ((0.618 * i) % 1.0) if jump else 0.5 + 0.01 * i
+        browser.evaluate(MOVE.format(name=name, share=share))
         wall = float(browser.until(LATENCY)) / 1000.0
         found.append((wall, processor_seconds(process) - before))
     return found[3:]
@@ -126,6 +127,8 @@ def main() -> None:
         sliders["ground albedo"] = "ground_albedo"
         for label, name in sliders.items():
             rows.append((f"slider to sky, {label}", latencies(browser, name, usage[0])))
+        jumps = latencies(browser, sliders["aerosol scattering"], usage[0], jump=True)
+        rows.append(("slider to sky, aerosol scattering, far jumps", jumps))
         look(browser, altitude_m=400e3, pitch_deg=-20)
         rows.append(("slider to sky, seen from space", latencies(browser, "mie.phase.g", usage[0])))
         for label, view in {"ground": {"altitude_m": 2, "pitch_deg": 12}, "space": {"altitude_m": 4e5}}.items():

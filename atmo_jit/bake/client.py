@@ -38,7 +38,8 @@ class BrunetonTables:
 
     ``transmittance`` [x_r, x_mu]; ``irradiance`` [x_r, x_mu_s] of the sky on a horizontal surface; ``rayleigh`` and
     ``mie`` [x_r, row of mu, x_nu, x_mu_s]: single scattering without phase functions, all aerosols together;
-    ``higher``: radiance of all orders >= 2.
+    ``higher``: radiance of all orders >= 2. ``size``: texels of the whole scattering tables; ``block``: what of them is
+    here.
     """
 
     mapping: Bruneton
@@ -47,6 +48,8 @@ class BrunetonTables:
     rayleigh: np.ndarray
     mie: np.ndarray
     higher: np.ndarray
+    size: tuple[int, int, int, int]
+    block: Block
 
     @property
     def scattering(self) -> np.ndarray:
@@ -56,8 +59,7 @@ class BrunetonTables:
     @property
     def higher_over_rayleigh(self) -> np.ndarray:
         """Orders >= 2 over Rayleigh's phase function: the clients' higher_order_scattering.rgb."""
-        altitudes, rows, angles, suns = self.higher.shape[:4]
-        _, mu, mu_s, nu = scattering_nodes(self.mapping, (altitudes, rows, angles, suns))
+        nu = scattering_nodes(self.mapping, self.size, self.block)[3]
         return self.higher / RayleighPhase().value(nu)[..., None].astype(np.float32)
 
     @property
@@ -98,7 +100,7 @@ def bruneton_tables(
     irradiance = np.stack([e.numpy() for e in diffuse], axis=-1).reshape(*IRRADIANCE, -1)
     parts = [_scattering(band, to, size, mie_weight, block) for band in sky.bands]
     return BrunetonTables(
-        to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
+        to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True)), size, block
     )
 
 

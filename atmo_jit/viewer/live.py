@@ -61,6 +61,7 @@ class Live:
         self.kind = "samples" if len(nm) == 3 and nm[0] > nm[1] > nm[2] else "spectral"
         self.warnings = check(air)
         self._last: _Tables | None = None
+        self._parameters: Any = None
 
     def describe(self) -> dict[str, Any]:
         """All that the page needs before it has tables."""
@@ -126,11 +127,11 @@ class Live:
         return self._tables(parameters).error(altitude, sun)
 
     def _tables(self, parameters: Any) -> _Tables:
-        air = changed(self.air, parameters)
-        if self._last is None or self._last.air != air:
+        if self._last is None or self._parameters != parameters:
+            air = changed(self.air, parameters)
             spare = self._last.found if self._last else None
             self._last = None  # its arrays are written over
-            self._last = _Tables(air, self.kind, self.tolerance, spare)
+            self._last, self._parameters = _Tables(air, self.kind, self.tolerance, spare), parameters
         return self._last
 
 
@@ -138,38 +139,53 @@ class _Tables:
     """The solved sky of one atmosphere, and those blocks of its tables that were asked for."""
 
     def __init__(self, air: Atmosphere, kind: str, tolerance: float, spare: ClientTables | None) -> None:
-        start = time.perf_counter()
-        self.air, self.colours, self.one = air, channels(air, kind), aerosol(air)
-        self.sky = Sky(air, tolerance=tolerance)
-        self.solve_s = time.perf_counter() - start
+        self.air, self.colours, self.one, self.tolerance = air, channels(air, kind), aerosol(air), tolerance
+        self._sky: Sky | None = None
+        self._suns = slice(0, 0)
+        self.solve_s = 0.0
         self.to = Bruneton(air.bottom_radius_m, air.top_radius_m, MU_S_MIN)
         self.known = np.zeros((ALTITUDES, SUNS), dtype=bool)
-        self.to_ground = self._transmittance_to_ground()
+        self.to_ground: np.ndarray | None = None
         self.found: ClientTables | None = None
         self._spare = spare
         self.bake_s = 0.0
         self._whole: dict[str, Any] | None = None
 
+    def solved(self, suns: slice) -> Sky:
+        """The sky under these suns: what is asked for first is solved for no others, in a third of the time, and
+        whatever comes after that for all."""
+        if self._sky is None or suns.start < self._suns.start or suns.stop > self._suns.stop:
+            start = time.perf_counter()
+            if self._sky is not None:
+                suns = slice(0, SUNS)
+            angles = np.arccos(self.to.sun_inverse(texels(SUNS)))[suns]
+            limits = None if suns == slice(0, SUNS) else (float(angles[-1]), float(angles[0]))
+            self._sky, self._suns = Sky(self.air, tolerance=self.tolerance, suns=limits), suns
+            self.solve_s = time.perf_counter() - start
+        return self._sky
+
     def fill(self, block: Block) -> None:
         """Bake a block, unless all of it is there; ``bake_s``: seconds that the last one took."""
         if self.known[block].all():
             return
-        start = time.perf_counter()
-        part = client_tables(self.sky, self.colours, self.one, MU_S_MIN, SCATTERING, block)
+        sky, start = self.solved(block[1]), time.perf_counter()
+        part = client_tables(sky, self.colours, self.one, MU_S_MIN, SCATTERING, block)
+        flat = [v.astype(np.float32) for v in (part.transmittance, part.irradiance)]
         if self.found is None:
             # To touch new memory takes as long as to solve.
             if self._spare is None:
                 whole = [np.zeros((*SCATTERING, 3), dtype=np.float32) for _ in range(2)]
             else:
                 whole = [self._spare.scattering, self._spare.single_mie]
-            flat = (v.astype(np.float32) for v in (part.transmittance, part.irradiance))
             self.found = ClientTables(self.to, self.one.g, *flat, *whole)
+            self.to_ground = self._transmittance_to_ground(sky)
+        self.found.transmittance, self.found.irradiance = flat
         self.found.scattering[block[0], :, :, block[1]] = part.scattering
         self.found.single_mie[block[0], :, :, block[1]] = part.single_mie
         self.known[block] = True
         self.bake_s = time.perf_counter() - start
 
-    def _transmittance_to_ground(self) -> np.ndarray:
+    def _transmittance_to_ground(self, sky: Sky) -> np.ndarray:
         """[altitude, row, 3] of the view rays that end there: what the air holds from the ground up along such a ray,
         less what it holds from its origin up."""
         h, mu, ground = view_rows(self.to, *SCATTERING[:2])
@@ -177,7 +193,7 @@ class _Tables:
         sine = np.sqrt((1.0 - mu) * (1.0 + mu)) * (1.0 + h / self.to.bottom)
         there = np.sqrt(np.maximum((1.0 - sine) * (1.0 + sine), 0.0))
         through = []
-        for band in self.sky.bands:
+        for band in sky.bands:
 
             def columns(optics: Any = band.optics) -> list[Any]:
                 whole = columns_up(optics, np.zeros(h.size), there.ravel())
@@ -191,19 +207,22 @@ class _Tables:
 
     def error(self, altitude: float, sun: float) -> dict[str, Any]:
         if self._whole is None and self.known.all():
-            self._whole = table_error(self.found, self.sky, self.colours)
-        known = self.known[self.cells(altitude, sun)].all()
-        return {"view": self._view_error(altitude, sun) if known else None, "whole": self._whole}
+            self._whole = table_error(self.found, self.solved(slice(0, SUNS)), self.colours)
+        cells = self.cells(altitude, sun)
+        view = self._view_error(self.solved(cells[1]), altitude, sun) if self.known[cells].all() else None
+        return {"view": view, "whole": self._whole}
 
     def cells(self, altitude: float, sun: float) -> Block:
-        """Altitudes and suns (rad) that a view reads; from space it sees all suns."""
-        thickness = self.air.thickness_m
-        i = np.clip(self.to.transmittance(min(altitude, thickness), 1.0)[0] * (ALTITUDES - 1), 0, ALTITUDES - 1)
-        k = np.clip(self.to.sun(np.cos(sun)) * (SUNS - 1), 0, SUNS - 1)
-        suns = slice(0, SUNS) if altitude > thickness else slice(int(k), int(np.ceil(k)) + 1)
-        return slice(int(i), int(np.ceil(i)) + 1), suns
+        """Altitudes and suns (rad) that a view reads: from space those of all places where rays may enter the air."""
+        top = self.air.top_radius_m
+        place = self.to.transmittance(min(altitude, self.air.thickness_m), 1.0)[0]
+        i = np.clip(place * (ALTITUDES - 1), 0, ALTITUDES - 1)
+        reach = np.arccos(min(top / (self.air.bottom_radius_m + altitude), 1.0))
+        suns = np.clip([sun + reach, sun - reach], 0.0, np.pi)
+        low, high = np.clip(self.to.sun(np.cos(suns)) * (SUNS - 1), 0, SUNS - 1)
+        return slice(int(i), int(np.ceil(i)) + 1), slice(int(low), int(np.ceil(high)) + 1)
 
-    def _view_error(self, altitude: float, sun: float) -> dict[str, Any]:
+    def _view_error(self, sky: Sky, altitude: float, sun: float) -> dict[str, Any]:
         rng = np.random.default_rng(0)
         bottom = self.air.bottom_radius_m
         edge = float(np.pi - np.arcsin(bottom / (bottom + altitude)))
@@ -215,7 +234,7 @@ class _Tables:
         off = min(np.radians(OFF_HORIZON_DEG), 0.1 * (edge - low))
         view, azimuth = (v[np.abs(view - edge) > off] for v in (view, azimuth))
         rays = [np.full(view.shape, altitude), np.full(view.shape, sun), view, azimuth]
-        light = self.sky.rays(*map(doubles, rays), ground=False).radiance
+        light = sky.rays(*map(doubles, rays), ground=False).radiance
         exact = self.colours.radiance(np.stack([v.numpy() for v in light], axis=-1))
         where = {"viewZenithDeg": np.degrees(view), "azimuthDeg": np.degrees(azimuth)}
         return asdict(compare(self.found.rays(*rays).T, exact.T, where))

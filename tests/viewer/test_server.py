@@ -156,6 +156,22 @@ def test_texels_are_those_of_the_exported_tables(server, earth):
     np.testing.assert_allclose(mie, exact.mie, rtol=1e-5)
 
 
+@pytest.mark.parametrize("suns", [slice(6, 10), slice(24, 28)], ids=["twilight", "day"])
+def test_what_is_shown_first_is_not_solved_worse(server, earth, suns):
+    """A sky that is solved for these suns alone, as after a slider's move."""
+
+    def texels(_):
+        live = Live(Atmosphere.load("earth"), "earth")
+        live.texels({}, [1, 3], [suns.start, suns.stop])
+        tables = live._tables({})
+        assert tables.solved(suns).suns is not None
+        return tables.found.scattering[1:3, :, :, suns]
+
+    exact = bruneton_tables(earth, block=(slice(1, 3), suns)).scattering
+    error = np.abs(server.ask(texels) - exact) / np.maximum(exact, 1e-3 * exact.max())
+    assert error.max() < 5e-3 and np.percentile(error, 99) < 5e-4
+
+
 def test_blocks_are_parts_of_the_whole(earth):
     size, block = (6, 8, 4, 8), (slice(2, 4), slice(1, 4))
     whole, part = (bruneton_tables(earth, size=size, block=b) for b in ((slice(None), slice(None)), block))
@@ -169,10 +185,30 @@ def test_blocks_are_parts_of_the_whole(earth):
         np.testing.assert_array_equal(np.broadcast_to(found, expected.shape), expected)
 
 
+@pytest.mark.parametrize("altitude, sun", [(2.0, 60.0), (59e3, 91.0), (400e3, 70.0), (2e7, 5.0)])
+def test_a_view_reads_no_other_texels(server, altitude, sun):
+    """Everything else is made far too bright, and rays all around the observer are drawn."""
+
+    def error(live):
+        tables = live._tables({})
+        block = tables.cells(altitude, np.radians(sun))
+        tables.known[:] = False
+        tables.fill(block)
+        for table in (tables.found.scattering, tables.found.single_mie):
+            kept = table[block[0], :, :, block[1]].copy()
+            table[:] = 1e9
+            table[block[0], :, :, block[1]] = kept
+        assert tables.known.sum() < 0.7 * tables.known.size
+        return live.error({}, altitude, sun)
+
+    found = server.ask(error)
+    assert found["view"]["worst"] < 3.0 and found["whole"] is None
+
+
 @pytest.fixture(scope="module")
 def earth(server):
     """The solved Earth, in the thread where the server solves."""
-    return server.ask(lambda live: live._tables({}).sky)
+    return server.ask(lambda live: live._tables({}).solved(slice(0, 32)))
 
 
 def test_the_command_refuses_in_one_line(capsys, server):

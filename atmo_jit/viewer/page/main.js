@@ -112,7 +112,8 @@ function paint() {
     byId("frame").textContent = `${ms.toFixed(0)}\u00a0ms${scale > 1 ? ` at 1/${scale} size` : ""}`;
     coarse = [1, 2, 4].find((c) => whole / c ** 2 <= SLOW_MS) || COARSEST;
     clearTimeout(timer);
-    if (scale > 1) timer = setTimeout(() => draw(1), STILL_MS);
+    // Not while a change is on its way: it will be drawn anyhow.
+    if (scale > 1) timer = setTimeout(() => tables.has(tables.needs(view)) && draw(1), STILL_MS);
 }
 
 function draw(scale) {

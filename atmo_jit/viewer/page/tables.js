@@ -47,16 +47,18 @@ export class Tables {
         return Array.from({length: altitudes}, () => new Array(suns).fill(false));
     }
 
-    /** Altitudes and suns that a view reads, [first, end] each. */
+    /** Altitudes and suns that a view reads, [first, end] each (live.cells, and one sun more for the next move). */
     needs(view) {
-        const {altitudes_m, suns_deg, thickness_m, scattering} = this.state;
-        const [count, , , suns] = scattering;
-        if (view.altitude_m > thickness_m) return [[count - 1, count], [0, suns]];
-        const above = altitudes_m.findIndex((h) => h > view.altitude_m);
-        const low = Math.max(0, (above < 0 ? count : above) - 1);
-        const higher = suns_deg.findIndex((angle) => angle < view.sun_zenith_deg);
-        const first = Math.max(0, (higher < 0 ? suns : higher) - 2);  // one more on either side, for the next move
-        return [[low, Math.min(low + 2, count)], [first, Math.min(first + 4, suns)]];
+        const {altitudes_m, suns_deg, thickness_m, bottom_radius_m, scattering} = this.state;
+        const [count, , , suns] = scattering, {altitude_m, sun_zenith_deg} = view;
+        const above = altitudes_m.findIndex((h) => h > altitude_m), low = (above < 0 ? count : above) - 1;
+        // How far around the planet rays from space enter the air.
+        const cosine = Math.min((bottom_radius_m + thickness_m) / (bottom_radius_m + altitude_m), 1);
+        const reach = Math.acos(cosine) * 180 / Math.PI;
+        const before = suns_deg.findIndex((angle) => angle < sun_zenith_deg + reach);
+        const after = suns_deg.findIndex((angle) => angle <= sun_zenith_deg - reach);
+        const first = Math.max((before < 0 ? suns : before) - 2, 0), end = Math.min((after < 0 ? suns : after) + 2, suns);
+        return [[low, Math.min(low + 2, count)], [Math.min(first, suns - 1), end]];
     }
 
     has([[a0, a1], [s0, s1]]) {
