@@ -31,6 +31,7 @@ _MODULE_OF = {
     "RayLight": "sky",
     "Sky": "sky",
     "SkyResult": "sky",
+    "earth_at": "earth",
 }
 _MODULES = ("atmosphere", "errors", "phase", "presets", "profile", "sky")
 
