@@ -10,7 +10,7 @@ test: .venv/ready
 slow: .venv/ready
 	$(BIN)/pytest -m slow
 
-# A real reader of what `atmo-jit export` writes, drawn in headless Chromium (which has to be installed).
+# A real reader of what `atmo-jit export` writes, and `atmo-jit view`, in headless Chromium (which has to be installed).
 client: .venv/ready .client/node_modules
 	$(BIN)/pytest -m client
 

@@ -28,12 +28,16 @@ _MODULE_OF = {
     "Constituent": "atmosphere",
     "InputError": "errors",
     "LLVMError": "errors",
+    "Linearization": "derivatives",
     "RayLight": "sky",
     "Sky": "sky",
     "SkyResult": "sky",
     "earth_at": "earth",
+    "differentiable": "derivatives",
+    "jacobian": "derivatives",
+    "linearize": "derivatives",
 }
-_MODULES = ("atmosphere", "errors", "phase", "presets", "profile", "sky")
+_MODULES = ("atmosphere", "derivatives", "errors", "phase", "presets", "profile", "sky")
 
 __all__ = ["__version__", *_MODULE_OF, *_MODULES]
 

@@ -35,12 +35,12 @@ def asarray(x: Any) -> Any:
     return x if is_drjit(x) else np.asarray(x, dtype=np.float64)
 
 
-def piecewise_linear(x: Any, knots: np.ndarray, values: np.ndarray) -> Any:
+def piecewise_linear(x: Any, knots: Any, values: Any) -> Any:
     """Linear interpolation of ``values`` at ascending ``knots``, held constant outside.
 
     A knot given twice is a step; there the value after the step holds. ``x`` is a NumPy array (any shape) or a Dr.Jit
-    array; the result has its type and shape. In Dr.Jit the tables are stored in the precision of ``x`` and
-    derivatives flow through ``x``.
+    array; the result has its type and shape. In Dr.Jit the tables are stored in the precision of ``x``, and may be
+    Dr.Jit arrays; derivatives flow through them and through ``x``.
     """
     if is_drjit(x):
         return _piecewise_linear_drjit(x, knots, values)
@@ -58,16 +58,19 @@ def _slopes(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.append(np.divide(rise, width, out=np.zeros_like(rise), where=width > 0), 0.0)
 
 
-def _piecewise_linear_drjit(x: Any, knots: np.ndarray, values: np.ndarray) -> Any:
+def _piecewise_linear_drjit(x: Any, knots: Any, values: Any) -> Any:
     import drjit as dr
 
     kind = type(x)
     # From lists, so that Dr.Jit owns the memory: it compiles the alignment of borrowed NumPy memory into the kernel.
-    at, value, slope = (kind(table.tolist()) for table in (knots, values, _slopes(knots, values)))
+    at, value = (table if is_drjit(table) else kind(table.tolist()) for table in (knots, values))
     start = dr.detach(x)
     # The first index whose knot lies beyond x; the segment that holds x starts at the one before it.
     beyond = dr.binary_search(0, len(knots), lambda i: dr.gather(kind, at, i, i < len(knots)) <= start)
     index = dr.uint32_array_t(dr.detached_t(kind))
     i = index(dr.maximum(index(beyond), 1) - 1)
-    offset = dr.maximum(x - dr.gather(kind, at, i), 0)
-    return dr.fma(offset, dr.gather(kind, slope, i), dr.gather(kind, value, i))
+    after = dr.minimum(i + 1, len(knots) - 1)
+    low, high, low_value, high_value = (dr.gather(kind, table, j) for table in (at, value) for j in (i, after))
+    width = high - low  # 0 for a step and after the last knot
+    slope = dr.select(width > 0, (high_value - low_value) / dr.select(width > 0, width, 1), 0)
+    return dr.fma(dr.maximum(x - low, 0), slope, low_value)

@@ -171,6 +171,17 @@ class Atmosphere:
         """The dotted names of all numbers, as :meth:`get` and :meth:`replace` take them."""
         return tuple(_leaves(self.to_dict()))
 
+    def given(self, dotted: str) -> Any:
+        """The value under a dotted name as the description has it: one number that stands for all wavelengths stays
+        one number. Raises KeyError where there is none."""
+        node: Any = self._document
+        for key in dotted.split("."):
+            if node is self._document and key not in node:
+                node = DEFAULTS[key]
+            else:
+                node = node[int(key)] if isinstance(node, list) else node[key]
+        return node
+
     def get(self, dotted: str) -> float | np.ndarray:
         """The value under a dotted name (``bottom_radius_m``, ``mie.phase.g``, ``mie.1.scattering_per_m``).
 

@@ -6,7 +6,8 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
@@ -92,22 +93,18 @@ def parameter(value: Any) -> Any:
     return dr.opaque(t.Float, float(value), 1)
 
 
-def packet(buffer: Any, index: Any, count: int, active: Any = True) -> list[Any]:
+def packet(buffer: Any, index: Any, count: int, active: Any = True, *, alone: bool = False) -> list[Any]:
     """``count`` consecutive values of a Float or UInt ``buffer`` from ``index * count`` on, as a list: packet loads
-    where the count is a power of two. Other counts are slow to run, and slower to compile."""
+    where the count is a power of two. Other counts are slow to run, and slower to compile. ``alone``: nothing else
+    reads the buffer; each thread then sums its derivatives for itself."""
     import drjit as dr
 
-    t = types()
+    t, mode = types(), dr.ReduceMode.Expand if alone else dr.ReduceMode.Auto
     one, several = (t.UInt, t.ArrayXu) if isinstance(buffer, t.UInt) else (t.Float, t.ArrayXf)
     if count == 1:
-        return [dr.gather(one, buffer, index, active)]
-    values = dr.gather(several, buffer, index, active, shape=(count, dr.width(index)))
+        return [dr.gather(one, buffer, index, active, mode=mode)]
+    values = dr.gather(several, buffer, index, active, mode=mode, shape=(count, dr.width(index)))
     return [values[i] for i in range(count)]
-
-
-def channels(values: Sequence[Any]) -> list[Any]:
-    """A list of opaque parameters, one per entry."""
-    return [parameter(v) for v in values]
 
 
 def padded(channel_count: int) -> int:
@@ -120,11 +117,14 @@ def row_size(count: int) -> int:
     return 1 << (count - 1).bit_length() if count <= 4 else -(-count // 8) * 8
 
 
-def row(buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True) -> list[Any]:
-    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``)."""
+def row(
+    buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True, *, alone: bool = False
+) -> list[Any]:
+    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``); ``alone``: see
+    packet."""
     size = row_size(length or count)
     step = min(size, 8)
-    parts = [packet(buffer, index * (size // step) + i, step, active) for i in range(-(-count // step))]
+    parts = [packet(buffer, index * (size // step) + i, step, active, alone=alone) for i in range(-(-count // step))]
     return [value for part in parts for value in part][:count]
 
 
@@ -156,20 +156,12 @@ def table(values: Any) -> Any:
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
-    import drjit as dr
-
-    out = _scattered(values, lane, size)
-    dr.eval(out)
-    return out
+    return evaluated(_scattered(values, lane, size))
 
 
 def tables_of(groups: Sequence[Sequence[Any]], lane: Any) -> list[Any]:
     """Each group of Floats as a table of rows, one per lane, evaluated together: in one kernel."""
-    import drjit as dr
-
-    out = [_scattered(values, lane, row_size(len(values))) for values in groups]
-    dr.eval(out)
-    return out
+    return evaluated([_scattered(values, lane, row_size(len(values))) for values in groups])
 
 
 def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
@@ -180,3 +172,64 @@ def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
     padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
     dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
     return out
+
+
+def evaluated(buffer: Any) -> Any:
+    """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
+
+    Several Floats in a list are evaluated together, in one kernel if they are of one width.
+
+    Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
+    the process ("dirty variable").
+    """
+    import drjit as dr
+
+    if isinstance(buffer, list):
+        dr.eval(buffer)
+        return [evaluated(one) for one in buffer]
+    if dr.grad_enabled(buffer):
+        return dr.custom(_evaluating(), buffer)
+    dr.eval(buffer)
+    return buffer
+
+
+@contextmanager
+def traversing() -> Iterator[None]:
+    """Derivatives are to be propagated through this package's kernels in such a block.
+
+    Dr.Jit 1.5 aborts the process ("dirty variable") where it sums derivatives into copies of a buffer, one per thread,
+    in a kernel with a loop; here it sums into the buffer itself.
+    """
+    import drjit as dr
+
+    threshold = dr.expand_threshold()
+    dr.set_expand_threshold(0)
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(threshold)
+
+
+@lru_cache(maxsize=1)
+def _evaluating() -> type:
+    import drjit as dr
+
+    class Evaluated(dr.CustomOp):
+        def eval(self, buffer: Any) -> Any:
+            dr.eval(buffer)
+            return buffer
+
+        def forward(self) -> None:
+            grad = self.grad_in("buffer")
+            dr.eval(grad)
+            self.set_grad_out(grad)
+
+        def backward(self) -> None:
+            grad = self.grad_out()
+            dr.eval(grad)
+            self.set_grad_in("buffer", grad)
+
+        def name(self) -> str:
+            return "evaluated"
+
+    return Evaluated

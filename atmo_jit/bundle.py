@@ -8,6 +8,7 @@ serves every azimuth asked for. That is how tables and pictures of the sky are f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -26,7 +27,7 @@ from .path_weights import PathWeights, columns_along
 from .paths import Paths, points_along
 from .projection import add_harmonics
 from .quadrature import half_circle
-from .single_scattering import Sunbeam, beam_along, sun_irradiance
+from .single_scattering import Sunbeam, azimuth_rows, azimuths_together, beam_along, sun_irradiance
 
 TWILIGHT = np.radians(85.0)  # beyond, the planet's shadow lies across the paths
 REFINE = (4, 12)  # levels per interval of the grid's altitudes at which sunlight is known: by day, at twilight
@@ -104,22 +105,37 @@ class Bundle:
             light = sun_irradiance(optics, columns, dr.zeros(t.Float, dr.width(lane)), mu_s)
             share = row(weights.reflected, end, channels)
             lit = table_of([a * b for a, b in zip(share, light, strict=True)], lane)
-        lane = dr.arange(t.UInt, nodes)
         width = kinds * channels
-        held = row(scattered, lane, azimuths * width) if kinds else []
-        values = []
-        for j in range(azimuths):
-            below = row(lit, lane * azimuths + j, channels) if ground else [t.Float(0.0)] * channels
-            values.append([*held[j * width : (j + 1) * width], *below])
-        phi, rows = half_circle(azimuths), []
-        for m in range(azimuths):
-            taps = np.cos(m * phi) * (2.0 if m else 1.0) / azimuths
-            for i in range(width + channels):
-                total = float(taps[0]) * values[0][i]
-                for tap, part in zip(taps[1:], values[1:], strict=True):
-                    total = dr.fma(float(tap), part[i], total)
-                rows.append(total)
-        return table_of(rows, lane), azimuths
+
+        def values(node: Any, group: Any) -> list[list[Any]]:
+            count = azimuths_together(azimuths)
+            above = azimuth_rows(scattered, node, group, azimuths, width) if kinds else [[]] * count
+            first = node * azimuths + group * count
+            below = [row(lit, first + i, channels) if ground else [t.Float(0.0)] * channels for i in range(count)]
+            return [[*a, *b] for a, b in zip(above, below, strict=True)]
+
+        return self._cosine_series(values, nodes, azimuths, azimuths), azimuths
+
+    def _cosine_series(
+        self, rows: Callable[[Any, Any], list[list[Any]]], nodes: int, azimuths: int, orders: int
+    ) -> Any:
+        """Cosine series [nodes, m x width] of ``orders`` terms through the ``rows(node, group)`` [width] at each
+        azimuth of a group."""
+        t, lane = types(), dr.arange(types().UInt, nodes)
+        cosines = self.grid.kept(("cosines", azimuths), lambda: floats(np.cos(half_circle(azimuths))))
+        first = rows(lane, t.UInt(0))
+        together, width = len(first), len(first[0])
+
+        def add(group: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            for part, cosine in zip(rows(lane, group), packet(cosines, group, together), strict=True):
+                sums = add_harmonics(sums, part, cosine)
+            return group + 1, sums
+
+        zero = [dr.zeros(t.Float, nodes) for _ in range(orders * width)]
+        end = dr.opaque(t.UInt, azimuths // together, 1)
+        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, max_iterations=-1, label="series")
+        share = dr.opaque(t.Float, 1.0 / azimuths, 1)
+        return table_of([share * s * (1.0 if j < width else 2.0) for j, s in enumerate(sums)], lane)
 
     def _at_ends(self, paths: Paths, sun: Any, lane: Any, azimuths: int) -> tuple[Any, Any]:
         """Cosine of the sun's zenith angle where paths end, and their last visits; lanes [P, S, azimuths]."""
@@ -187,17 +203,11 @@ class Bundle:
             share = row(weights.reflected, end, channels)
             sums = [dr.fma(a, b, s) for a, b, s in zip(share, lit, sums, strict=True)]
         radiance = table_of([dr.maximum(s, 0.0) for s in sums], lane)
-        lane = dr.arange(t.UInt, len(paths.h) * suns)
 
-        def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            values = row(radiance, lane * azimuths + j, channels)
-            return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j))
+        def seen_at(node: Any, azimuth: Any) -> list[list[Any]]:
+            return [row(radiance, node * azimuths + azimuth, channels)]
 
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(orders * channels)]
-        end = dr.opaque(t.UInt, azimuths, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="series")
-        share = dr.opaque(t.Float, 1.0 / azimuths, 1)
-        return table_of([share * s * (1.0 if j < channels else 2.0) for j, s in enumerate(sums)], lane), azimuths
+        return self._cosine_series(seen_at, len(paths.h) * suns, azimuths, orders), azimuths
 
     def _nodes(self, theta: np.ndarray, per_node: int) -> tuple[int, int]:
         """First and last of the suns that the paths can see, counted ``per_node`` of the grid's."""

@@ -27,6 +27,7 @@ COMMANDS = {
     "fit": "Fit an atmosphere to measured sky radiance.",
     "plan": "What a scene or views need: what is built or skipped, and its cost.",
     "bench": "Run time against error of every method and peer on this machine.",
+    "view": "The sky in a browser, while sliders change the air.",
     "info": "Versions, the LLVM library in use, the atmospheres that come along.",
 }
 

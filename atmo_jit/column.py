@@ -15,6 +15,7 @@ the logarithm of their mean is interpolated linearly in h.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -56,7 +57,15 @@ class SunColumns:
         bounds = np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.arange(self._shells)])
         self._bounds, self._cells = floats(bounds), floats(bounds[np.clip(cell_start, 0, self._shells - 1)])
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
+        self._rule = integration_rule(optics)
         self.table = table if table is not None else self._build() if self._count else None
+
+    def of(self, optics: Optics) -> SunColumns:
+        """The table for other optics with profiles of the same kind, cut at the same altitudes."""
+        other = copy(self)
+        other.optics = optics
+        other.table = other._build() if self._count else None
+        return other
 
     def _build(self) -> Any:
         t = types()
@@ -68,7 +77,7 @@ class SunColumns:
         # Each end belongs to this shell's side of the break.
         h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
-        totals = column_up(self.optics, h, mu)
+        totals = column_up(self.optics, h, mu, self._rule)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         at_top = self.optics.densities(h)  # where the path has no length
         means = []
@@ -86,7 +95,7 @@ class SunColumns:
         if not self._count:
             return []
         radius = self.optics.radius
-        mu = dr.maximum(mu, -dr.sqrt(h * (2.0 * radius + h)) / (radius + h))
+        mu = dr.maximum(mu, -dr.safe_sqrt(h * (2.0 * radius + h)) / (radius + h))
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
@@ -101,12 +110,12 @@ class SunColumns:
         """Columns to the top from ``h`` along mu >= 0; None: horizontally."""
         t = types()
         cosines = self._cosines
-        position = dr.sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
+        position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
         _, high, _, shell = packet(self._cells, dr.minimum(t.UInt(position), _CELLS), 4, active)
         shell = t.UInt(dr.minimum(dr.select(h >= high, shell + 1.0, shell), self._shells - 1.0))
         _, high, per_width, _ = packet(self._bounds, shell, 4, active)
         depth = dr.clip((high - h) * per_width, 0.0, 1.0)
-        y = dr.sqrt(depth) * self._rows
+        y = dr.safe_sqrt(depth) * self._rows
         below = dr.minimum(t.UInt(y), self._rows - 1)
         start = t.Float(below)
         by_root = y - start
@@ -132,22 +141,26 @@ class SunColumns:
 
 def sun_columns(optics: Optics, grid: Grid) -> SunColumns:
     """The table for an atmosphere, kept with the grid unless the profiles carry derivatives."""
-    if optics.profiles_differentiable:
-        return SunColumns(optics, grid.resolution.columns)
-    return grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    with dr.suspend_grad():
+        columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
+    return columns.of(optics) if optics.profiles_differentiable else columns
 
 
-def column_up(optics: Optics, h: Any, mu: Any) -> list[Any]:
+def integration_rule(optics: Optics) -> tuple[Any, Any]:
+    """What column_up integrates by: the altitudes between which profiles are smooth; nodes and weights in between."""
+    return floats(optics.breaks_m), floats(np.column_stack(gauss_legendre(NODES_PER_LAYER)))
+
+
+def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = None) -> list[Any]:
     """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the
-    profile's breaks."""
+    profile's breaks. ``rule``: see integration_rule."""
     t, count = types(), NODES_PER_LAYER
-    breaks = floats(optics.breaks_m)
-    rule = floats(np.column_stack(gauss_legendre(count)))
+    breaks, nodes = rule or integration_rule(optics)
 
     # One node per pass, not one layer: a quarter of the code to compile.
     def add(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:
         low, high = (dr.maximum(dr.gather(t.Float, breaks, index // count + i), h) for i in (0, 1))
-        node, weight = packet(rule, index % count, 2)
+        node, weight = packet(nodes, index % count, 2)
         start = distance_up(optics.radius, h, mu, low)
         length = distance_up(optics.radius, h, mu, high) - start
         there, _ = altitude_along(optics.radius, h, mu, dr.fma(length, node, start))

@@ -14,8 +14,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, row, stored, types, uints
+from .backend import evaluated, floats, packet, padded, row, stored, types, uints
 from .column import SunColumns
+from .geometry import safe_sine
 from .grid import Grid, split
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
@@ -29,8 +30,10 @@ class Field:
 
     ``moments`` [K, suns, pairs(degree), channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
     channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above.
-    ``scatters``: whether any of it scatters once more.
+    ``scatters``: whether any of it scatters once more. ``shares``: what each order above the first counts in them.
     """
+
+    shares: list[Any]
 
     def __init__(
         self,
@@ -93,13 +96,16 @@ class Field:
     @cached_property
     def _tables(self) -> tuple[Any, Any, Any, Any]:
         """Moments at refined suns for look-ups, phase moments, and the recurrences of harmonics."""
-        l_, m = pairs(self.degree)
-        rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+
+        def steps() -> tuple[Any, Any]:
+            l_, m = pairs(self.degree)
+            rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
+            return floats(rows), floats(l_)
+
         return (
             self._refined(self.moments, pair_count(self.degree)),
             self.optics.phase_moments(self.degree),
-            floats(rows),
-            floats(l_),
+            *self.grid.kept(("recurrences", self.degree), steps),
         )
 
     @cached_property
@@ -115,7 +121,13 @@ class Field:
     def _irradiances(self) -> tuple[Any, Any]:
         return self._refined(self.sky, 1), self._refined(self.reflected, 1)
 
-    def _corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
+    def refined_moments(self) -> np.ndarray:
+        """Moments over the reference at the nodes of look-ups, float32 [levels x suns, pairs, channels]."""
+        moments = np.array(dr.detach(self._tables[0]), dtype=np.float32)
+        moments = moments.reshape(-1, pair_count(self.degree), padded(self.optics.channel_count))
+        return moments[..., : self.optics.channel_count]
+
+    def corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
         [2][channel]."""
         suns = self.grid.sources
@@ -156,49 +168,86 @@ class Field:
         (march.Source)."""
         t = types()
         channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
-        size = padded(channels)
-        nodes, weights, scales = self._corners(h, mu_s, active)
-        sine = dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
-        count = pair_count(self.degree)
-        stride = dr.opaque(t.UInt, count, 1)
-        moments, phases, recurrences, degrees = self._tables
+        nodes, weights, scales = self.corners(h, mu_s, active)
+        weights = [[w * scales[i // 2][c] for c in range(channels)] for i, w in enumerate(weights)]
+        sine = safe_sine(mu)
+        basis = _Harmonics(dr.detach(mu), dr.detach(sine * cos_phi), slopes=dr.grad_enabled(mu, cos_phi))
+        moments, phases, recurrences, degrees = (evaluated(table) for table in self._tables)
+        stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
 
-        def pair(
-            i: Any, diagonal: Any, last: Any, before: Any, cos_m: Any, cos_m1: Any, sums: list[Any]
-        ) -> tuple[Any, ...]:
-            a, b, start, is_diagonal = packet(recurrences, i, 4, active)
-            new_m = start > 0.0
-            diagonal = dr.select(new_m, diagonal * sine * start, diagonal)
-            next_cos = dr.select(new_m, 2.0 * cos_phi * cos_m - cos_m1, cos_m)
-            cos_m1 = dr.select(new_m, cos_m, cos_m1)
-            value = dr.select(is_diagonal > 0.0, diagonal, a * (mu * last - b * before))
-            before = dr.select(is_diagonal > 0.0, 0.0, last)
-            basis = value * next_cos
-            corner = [packet(moments, node * stride + i, size, active) for node in nodes]
-            moment = [
-                _blend([w * scales[i // 2][c] for i, w in enumerate(weights)], [v[c] for v in corner]) * basis
-                for c in range(channels)
-            ]
+        def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
+            values, state = basis.next(packet(recurrences, i, 4, active), state)
+            corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
+            moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
             degree = t.UInt(dr.gather(t.Float, degrees, i, active))
             chi = row(phases, degree, kinds * channels, active=active)
-            sums = [dr.fma(chi[n], moment[n % channels], sums[n]) for n in range(kinds * channels)]
-            return i + 1, diagonal, value, before, next_cos, cos_m1, sums
+            light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
+            return i + 1, state, [
+                [dr.fma(value, part, s) for part, s in zip(light, old, strict=True)]
+                for value, old in zip(values, sums, strict=True)
+            ]
 
         width = dr.width(h)
+        sums = [[dr.zeros(t.Float, width) for _ in range(kinds * channels)] for _ in range(basis.count)]
+        state = (t.UInt(0), basis.start(width), sums)
+        *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, max_iterations=-1, label="scattered")
+        total = sums[0]
+        if basis.slopes:
+            # The directions enter the loop without derivatives, which here follow from the sums of the slopes.
+            steps = mu - basis.mu, sine * cos_phi - basis.x
+            for step, slopes in zip(steps, sums[1:], strict=True):
+                total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
+        return [[dr.maximum(total[n * channels + c], 0.0) for c in range(channels)] for n in range(kinds)]
+
+
+class _Harmonics:
+    """Real spherical harmonics cos(m phi) P_lm(mu) by recurrence over the pairs (l, m), and their slopes.
+
+    As polynomials in mu and x = sin(theta) cos(phi), which are smooth at the zenith as well: P_lm has the factor
+    sin^m(theta), and sin^m cos(m phi) follows from q_(m+1) = 2 x q_m - sin^2 q_(m-1).
+    """
+
+    def __init__(self, mu: Any, x: Any, *, slopes: bool) -> None:
+        self.mu, self.x, self.slopes = mu, x, slopes
+        self.count = 3 if slopes else 1
+        self._square = (1.0 - mu) * (1.0 + mu)
+
+    def start(self, width: int) -> list[Any]:
+        """m of the pair before the first; P over sin^m at it, its last two in l; q_m and q_(m-1); then all slopes: of P
+        by mu, of q by x and by mu."""
+        t = types()
         zero, one = dr.zeros(t.Float, width), dr.full(t.Float, 1.0, width)
-        # cos(0 phi) = 1, and cos(-1 phi) = cos phi starts the recurrence cos((m + 1) phi) = 2 cos phi cos(m phi) -
-        # cos((m - 1) phi).
-        state = (
-            t.UInt(0),
-            one * 0.28209479,
-            zero,
-            zero,
-            one,
-            cos_phi + zero,
-            [dr.zeros(t.Float, width) for _ in range(kinds * channels)],
-        )
-        *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
-        return [[dr.maximum(sums[n * channels + c], 0.0) for c in range(channels)] for n in range(kinds)]
+        state = [t.Float(0.0) + zero, one * 0.28209479, zero + 0.0, zero + 0.0, one + 0.0, zero + 0.0]
+        return state + [zero + 0.0 for _ in range(6 if self.slopes else 0)]
+
+    def next(self, recurrence: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+        """Values at the next pair (the harmonic, its slopes by mu and x), and the state there."""
+        a, b, start, is_diagonal = recurrence
+        m, diagonal, last, before, q, q_before, *slopes = state
+        new_m, first = start > 0.0, is_diagonal > 0.0
+        twice = dr.select(m > 0.0, 2.0, 1.0)
+        diagonal = dr.select(new_m, diagonal * start, diagonal)
+        p = dr.select(first, diagonal, a * (self.mu * last - b * before))
+        q_next = dr.select(new_m, twice * self.x * q - self._square * q_before, q)
+        values, new = [p * q_next], []
+        if self.slopes:
+            p_last, p_before, x_q, x_before, mu_q, mu_before = slopes
+            p_mu = dr.select(first, 0.0, a * (last + self.mu * p_last - b * p_before))
+            x_next = dr.select(new_m, twice * (q + self.x * x_q) - self._square * x_before, x_q)
+            mu_next = dr.select(
+                new_m, twice * self.x * mu_q - self._square * mu_before + 2.0 * self.mu * q_before, mu_q
+            )
+            values += [p_mu * q_next + p * mu_next, p * x_next]
+            new = [
+                p_mu,
+                dr.select(first, 0.0, p_last),
+                x_next,
+                dr.select(new_m, x_q, x_before),
+                mu_next,
+                dr.select(new_m, mu_q, mu_before),
+            ]
+        old = [dr.select(first, 0.0, last), q_next, dr.select(new_m, q, q_before)]
+        return values, [dr.select(new_m, m + 1.0, m), diagonal, p, *old, *new]
 
 
 def _blend(weights: list[Any], values: list[Any]) -> Any:
@@ -226,5 +275,4 @@ def _between_levels(grid: Grid, values: Any, length: int) -> Any:
     for i in range(count):
         value = dr.gather(t.Float, values, (start + i) * length + place)
         total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
-    dr.eval(total)
-    return total
+    return evaluated(total)

@@ -62,6 +62,23 @@ def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
     return target
 
 
+def check_folder(path: str | os.PathLike[str]) -> Path:
+    """``path`` as the name of a folder that can be written to, or made. Raises InputError otherwise."""
+    path = Path(path)
+    try:
+        nearest = path.resolve()
+        while not nearest.exists():
+            nearest = nearest.parent
+        is_folder = nearest.is_dir()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"output {shown(str(path), 200)}: {_reason(error)}") from None
+    if not is_folder:
+        raise InputError(f"output {shown(str(path), 200)}: {shown(str(nearest), 200)} is not a folder")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"output {shown(str(path), 200)}: the folder {shown(str(nearest), 200)} cannot be written")
+    return path
+
+
 @contextmanager
 def atomic_outputs(*paths: Path) -> Iterator[tuple[Path, ...]]:
     """Temporary files (empty, with the same suffixes) that become ``paths`` at the end of the block.

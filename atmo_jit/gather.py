@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, row_size, stored, table, table_of, types, uints
+from .backend import evaluated, floats, packet, row, row_size, stored, table, table_of, types, uints
 from .geometry import safe_sine
 from .grid import Grid, cubic
 from .harmonics import legendre, pair_index, pairs
@@ -28,8 +28,6 @@ from .paths import Directions, Paths, paths_along
 from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
-
-FEW_ROWS = 8  # degrees up to which the sum over l is unrolled
 
 
 class Samples:
@@ -42,15 +40,17 @@ class Samples:
     def __init__(self, grid: Grid, directions: Directions, azimuths: int) -> None:
         t = types()
         self.paths = paths = paths_along(grid, directions, 1)
-        suns, device = grid.shape[1], self.paths.device
+        suns = grid.shape[1]
         lane = dr.arange(t.UInt, len(paths.station) * suns * azimuths)
         azimuth, rest = lane % azimuths, lane // azimuths
         sun, visit = rest % suns, rest // suns
         cos_phi = dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), azimuth)
-        mu_s, sin_s = (dr.gather(t.Float, floats(f(grid.theta)), sun) for f in (np.cos, np.sin))
-        mu0 = dr.gather(t.Float, device.mu_start, dr.gather(t.UInt, device.ray, visit))
-        mu = dr.gather(t.Float, floats(paths.mu[paths.station]), visit)
-        cos_turn, sin_turn = packet(device.turns, visit, 2)
+        mu_s, sin_s = packet(floats(np.column_stack([np.cos(grid.theta), np.sin(grid.theta)])), sun, 2)
+        # One packet per visit: gathers of single numbers take long to compile.
+        of_visit = paths.station
+        turns = paths.cos_turn[of_visit], paths.sin_turn[of_visit]
+        places = floats(np.column_stack([*turns, paths.mu[of_visit], paths.mu_start[paths.ray[of_visit]]]))
+        cos_turn, sin_turn, mu, mu0 = packet(places, visit, 4)
         nu = dr.fma(mu0, mu_s, safe_sine(mu0) * sin_s * cos_phi)
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
         self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
@@ -157,19 +157,22 @@ class Gather:
 
         place, sign, which = grid.kept(("rows", degree, light.most, orders, channels), places)
         lane = dr.arange(t.UInt, altitudes * (suns + 2) * rows * width)
-        entry, node = lane % (rows * width), lane // (rows * width)
+        size = dr.opaque(t.UInt, rows * width, 1)
+        node = lane // size
+        entry = lane - node * size
         sun, k = node % (suns + 2), node // (suns + 2)
         there, channel = dr.gather(t.UInt, which, sun), entry % width % channels
         index = dr.gather(t.UInt, place, entry)
         held = index > 0
         every = (light.suns - 1) // (suns - 1)
-        index = light.index(k, dr.maximum(index, 1) - 1, there * every, channel)
+        strides = (light.index(*place) for place in ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, every, 0)))
+        of_k, of_entry, of_sun = (dr.opaque(t.UInt, stride, 1) for stride in strides)
+        index = k * of_k + (dr.maximum(index, 1) - 1) * of_entry + there * of_sun + channel
         value = dr.gather(t.Float, light.values, index, held)
         inverse = dr.gather(t.Float, self.reference.inverse, self.reference.index(k, there, channel), held)
         mirrored = dr.select(sun == 0, dr.gather(t.Float, sign, entry), 1.0)
         values = value * inverse * mirrored
-        dr.eval(values)
-        return values
+        return evaluated(values)
 
 
 def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:
@@ -178,7 +181,7 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
     t = types()
     s = dr.minimum(t.UInt(x), suns - 2)
     taps = cubic(x - t.Float(s))
-    corners = [row(table, first + s + n, orders * channels) for n in range(4)]
+    corners = [row(table, first + s + n, orders * channels, alone=True) for n in range(4)]
     cos_m, cos_before = 1.0, cos_phi
     total = [0.0] * channels
     for m in range(orders):
@@ -200,19 +203,16 @@ def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int,
     sun, visit = lane % suns, lane // suns
     node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun
 
-    def add(l_: Any, sums: list[Any], entries: int = width) -> tuple[Any, list[Any]]:
-        weight = row(weights, visit * rows + l_, entries, width)
-        value = row(moments, node * rows + l_, entries, width)
-        return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums[:entries], strict=True)] + sums[entries:]
+    size = dr.opaque(t.UInt, rows, 1)
 
-    sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
-    if rows <= FEW_ROWS:
-        for l_ in range(rows):
-            # Degree l has l + 1 harmonics; the irradiance comes last, in the first place.
-            _, sums = add(l_, sums, channels if l_ == rows - 1 else min(l_ + 1, orders) * channels)
-    else:
-        end = dr.opaque(t.UInt, rows, 1)
-        _, sums = dr.while_loop((t.UInt(0), sums), lambda i, _: i < end, add, max_iterations=-1, label="contract")
+    def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        weight, value = (
+            row(table, place * size + l_, width, alone=True) for table, place in ((weights, visit), (moments, node))
+        )
+        return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums, strict=True)]
+
+    zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+    _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < size, add, max_iterations=-1, label="contract")
     return table_of(sums, lane)
 
 
@@ -233,7 +233,10 @@ def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, de
     basis = paths.kept(("harmonics", degree, orders), harmonics)
     chi = optics.phase_moments(degree + 1)
     lane = dr.arange(t.UInt, len(paths.station) * rows)
-    l_, visit = lane % rows, lane // rows
+    # Sizes are read from memory: one kernel for all of them.
+    size = dr.opaque(t.UInt, rows, 1)
+    visit = lane // size
+    l_ = lane - visit * size
     products = [0.0] * channels
     if kinds:
         weight, moment = row(scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
@@ -243,7 +246,7 @@ def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, de
             ]
     values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
     if reflected is not None:
-        last = l_ == rows - 1
+        last = l_ == size - 1
         ground = row(reflected, visit, channels, active=last)
         values[:channels] = [dr.select(last, r, v) for r, v in zip(ground, values, strict=False)]
     return table_of(values, lane)

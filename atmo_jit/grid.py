@@ -21,6 +21,8 @@ from .profile import Tabulated
 from .resolution import Resolution, column_of
 
 _FINE = 2048
+_PLANET = ("bottom_radius_m", "top_radius_m", "sun_angular_radius_deg")
+NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
@@ -56,6 +58,18 @@ class Grid(Keeper):
         while len(cls._known) > REMEMBERED:
             cls._known.popitem(last=False)
         return cls._known[key]
+
+    @staticmethod
+    def suits(nodes: Atmosphere, atmosphere: Atmosphere) -> bool:
+        """Whether the grid for ``nodes`` serves another atmosphere too: one with the same profiles and planet, whose
+        optical depths are not far from its own."""
+        own, others = nodes.constituents, atmosphere.constituents
+        same = all(getattr(nodes, name) == getattr(atmosphere, name) for name in _PLANET) and len(own) == len(others)
+        return same and all(
+            profile_key(a.profile) == profile_key(b.profile)
+            and abs(_matter(nodes, a)[1] - _matter(atmosphere, b)[1]) <= NEAR
+            for a, b in zip(own, others, strict=True)
+        )
 
     def __init__(
         self, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None
@@ -161,7 +175,10 @@ class Grid(Keeper):
     def locate_altitude(self, h: Any) -> tuple[Any, Any]:
         """Index of the level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
-        position = dr.sqrt(dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)) * _FINE
+        # The slope of a square root at 0 is no slope of the light: on the ground that of a little above is taken.
+        lowest = 4.0 / _FINE**2
+        share = dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)
+        position = dr.sqrt(share + dr.detach(dr.maximum(lowest - share, 0.0))) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
         return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self.level_count)
@@ -173,7 +190,7 @@ class Grid(Keeper):
     def sun_position(self, mu_s: Any) -> Any:
         """Sun coordinate of cos(sun zenith) ``mu_s``: s at node s, clipped to the first and the last."""
         center, width, scale, offset, last = self._sun_map
-        theta = dr.acos(mu_s)
+        theta = dr.safe_acos(mu_s)
         bend = dr.atan((theta - center) / width) + dr.atan(center / width)
         return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta) - offset, 0.0, last)
 

@@ -77,7 +77,7 @@ def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
     Bruneton 2017, GetTransmittanceToSun; a point sun (radius 0) is cut sharply.
     """
     horizon_sine = optics.radius / r
-    horizon_mu = -dr.sqrt(h * (2.0 * optics.radius + h)) / r
+    horizon_mu = -dr.safe_sqrt(h * (2.0 * optics.radius + h)) / r
     half_width = dr.maximum(horizon_sine * optics.sun_radius, 1e-7)
     x = dr.clip(0.5 + 0.5 * (mu_s - horizon_mu) / half_width, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
@@ -119,25 +119,43 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     return edges
 
 
+class Shells:
+    """What a march looks up: the altitudes (m) at which it cuts, the largest extinction (1/m) between two of them, and
+    quadrature rules."""
+
+    def __init__(self, optics: Optics) -> None:
+        self.breaks = floats(optics.breaks_m)
+        self.last = parameter(len(optics.breaks_m) - 2.0)
+        self.densest = _largest_extinctions(optics, self.breaks)
+        self._rules: dict[int, Rule] = {}
+
+    def rule(self, nodes: int) -> Rule:
+        """The rule of so many nodes."""
+        if nodes not in self._rules:
+            self._rules[nodes] = Rule(nodes)
+        return self._rules[nodes]
+
+
 class Rule:
     """A Gauss-Legendre rule as a loop: node g with its weight and the running integral of the densities at FEW
     coarser nodes.
 
-    The node count is a parameter: another one needs no other kernel.
+    The node count is a parameter: another one needs no other kernel. ``rows``: those of a rule of as many nodes.
     """
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, rows: Any = None) -> None:
         t = types()
         x, w = gauss_legendre(nodes)
         few_x, few_w = gauss_legendre(FEW)
         self.few_x, self.few_w = few_x.tolist(), few_w.tolist()
-        rows = np.column_stack([x, w, running_integral(FEW, tuple(x)), np.zeros((nodes, 8 - 2 - FEW))])
-        self._rows = floats(rows)
+        if rows is None:
+            rows = floats(np.column_stack([x, w, running_integral(FEW, tuple(x)), np.zeros((nodes, 8 - 2 - FEW))]))
+        self.rows = rows
         self.count = dr.opaque(t.UInt, nodes, 1)
 
     def at(self, g: Any) -> list[Any]:
         """Node x, weight w, and the FEW coefficients of the column up to x."""
-        return packet(self._rows, g, 8)[: 2 + FEW]
+        return packet(self.rows, g, 8)[: 2 + FEW]
 
     def sum(self, coefficients: list[Any], density: list[list[Any]], constituent: int) -> Any:
         """Sum over the few nodes of coefficient times density."""
@@ -145,6 +163,47 @@ class Rule:
         for coefficient, values in zip(coefficients[1:], density[1:], strict=True):
             total = dr.fma(coefficient, values[constituent], total)
         return total
+
+
+class Cuts:
+    """Where rays are cut into pieces."""
+
+    def __init__(self, optics: Optics, rays: Rays, *, sunlit: bool = True, shells: Shells | None = None) -> None:
+        self._optics, self._rays = optics, rays
+        shells = shells or Shells(optics)
+        self._breaks, self._last, self._densest = shells.breaks, shells.last, shells.densest
+        self._perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
+        self._r_mu = (optics.radius + rays.h) * rays.mu
+        self._edges = _sunlight_edges(optics, rays) if sunlit else []
+        self._farthest = MAX_TURN * optics.radius
+
+    def first_shell(self) -> Any:
+        """The shell that each ray starts in."""
+        return _first_shell(self._optics, self._rays, self._breaks, self._last)
+
+    def after(self, d: Any, shell: Any) -> tuple[Any, Any]:
+        """Distance to the end of the piece that starts at ``d`` in ``shell``, and the shell after it."""
+        t, rays, radius, breaks = types(), self._rays, self._optics.radius, self._breaks
+        falling = self._r_mu + d < 0.0
+        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
+        bottoms_out = falling & (target <= self._perigee)
+        crossing = dr.select(
+            bottoms_out,
+            -self._r_mu,
+            dr.select(
+                falling,
+                distance_down(radius, rays.h, rays.mu, target),
+                distance_up(radius, rays.h, rays.mu, target),
+            ),
+        )
+        longest = MAX_DEPTH / dr.maximum(dr.gather(t.Float, self._densest, t.UInt(shell)), 1e-30)
+        limit = d + dr.minimum(longest, self._farthest)
+        end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
+        for edge in self._edges:
+            end = dr.select(edge > d, dr.minimum(end, edge), end)
+        passed = (end >= crossing) & ~bottoms_out
+        step = dr.select(falling, -1.0, 1.0)
+        return end, dr.select(passed, dr.clip(shell + step, 0.0, self._last), shell)
 
 
 def march(
@@ -155,12 +214,14 @@ def march(
     nodes: int = NODES,
     single: bool = True,
     source: Source | None = None,
+    shells: Shells | None = None,
 ) -> Light:
     """Radiance scattered toward the origin of each ray, per unit of ``optics.solar``; ground light is not included.
 
     Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's
     shadow. ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the
-    centroid of the piece's weight, which is exact for a field that is linear there.
+    centroid of the piece's weight, which is exact for a field that is linear there. ``shells``: those of these
+    optics, where they cannot be made because a kernel is being traced.
     """
     t = types()
     c_count, k_count = optics.channel_count, len(optics.constituents)
@@ -168,32 +229,13 @@ def march(
     if k_count == 0:
         zero = [dr.zeros(t.Float, width) for _ in range(c_count)]
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(c_count)])
-    breaks = floats(optics.breaks_m)
-    last = parameter(len(optics.breaks_m) - 2.0)
-    densest = _largest_extinctions(optics, breaks)
-    perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
-    r_mu = (optics.radius + rays.h) * rays.mu
-    edges = _sunlight_edges(optics, rays) if single else []
-    rule, farthest = Rule(nodes), MAX_TURN * optics.radius
+    shells = shells or Shells(optics)
+    cuts, r_mu = Cuts(optics, rays, sunlit=single, shells=shells), (optics.radius + rays.h) * rays.mu
+    rule = shells.rule(nodes)
     phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
-        falling = r_mu + d < 0.0
-        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
-        bottoms_out = falling & (target <= perigee)
-        crossing = dr.select(
-            bottoms_out,
-            -r_mu,
-            dr.select(
-                falling,
-                distance_down(optics.radius, rays.h, rays.mu, target),
-                distance_up(optics.radius, rays.h, rays.mu, target),
-            ),
-        )
-        limit = d + dr.minimum(MAX_DEPTH / dr.maximum(dr.gather(t.Float, densest, t.UInt(shell)), 1e-30), farthest)
-        end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
-        for edge in edges:
-            end = dr.select(edge > d, dr.minimum(end, edge), end)
+        end, shell = cuts.after(d, shell)
         length = end - d
 
         density = [
@@ -238,25 +280,18 @@ def march(
 
         for k in range(k_count):
             amounts[k] = dr.fma(length, rule.sum(rule.few_w, density, k), amounts[k])
-        crossed = end >= crossing
-        shell = dr.select(crossed & ~bottoms_out, dr.clip(shell + dr.select(falling, -1.0, 1.0), 0.0, last), shell)
         return end, shell, amounts, one, more
-
-    def unfinished(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> Any:
-        depths = optics.optical_depths(amounts)
-        thinnest = depths[0]
-        for depth in depths[1:]:
-            thinnest = dr.minimum(thinnest, depth)
-        return (d < rays.stop) & (thinnest < SPENT_DEPTH)
 
     state = (
         dr.zeros(t.Float, width),
-        _first_shell(optics, rays, breaks, last),
+        cuts.first_shell(),
         [dr.zeros(t.Float, width) for _ in range(k_count)],
         [dr.zeros(t.Float, width) for _ in range(c_count)],
         [dr.zeros(t.Float, width) for _ in range(c_count)],
     )
-    _, _, amounts, one, more = dr.while_loop(state, unfinished, piece, label="march")
+    _, _, amounts, one, more = dr.while_loop(
+        state, lambda d, _, amounts, *__: unfinished(optics, rays, d, amounts), piece, label="march"
+    )
     return Light(
         [radiance * solar for radiance, solar in zip(one, optics.solar, strict=True)],
         more,
@@ -264,10 +299,20 @@ def march(
     )
 
 
+def unfinished(optics: Optics, rays: Rays, d: Any, amounts: list[Any]) -> Any:
+    """Whether anything is to be seen beyond the distance ``d``, ``amounts`` of matter (m) away."""
+    depths = optics.optical_depths(amounts)
+    thinnest = depths[0]
+    for depth in depths[1:]:
+        thinnest = dr.minimum(thinnest, depth)
+    return (d < rays.stop) & (thinnest < SPENT_DEPTH)
+
+
 def relative_azimuth(mu: Any, mu_s: Any, nu: Any) -> Any:
     """cos of the azimuth between view and sun at a point: (nu - mu mu_s) / (sin sin_s); 1 where either is vertical."""
     sines = safe_sine(mu) * safe_sine(mu_s)
-    return dr.select(sines > 0.0, dr.clip((nu - mu * mu_s) / sines, -1.0, 1.0), 1.0)
+    apart = sines > 0.0
+    return dr.select(apart, dr.clip((nu - mu * mu_s) / dr.select(apart, sines, 1.0), -1.0, 1.0), 1.0)
 
 
 def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:

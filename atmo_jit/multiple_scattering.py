@@ -7,7 +7,6 @@ and the next follows by gathering along straight paths from every node.
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -23,6 +22,7 @@ from .grid import Grid
 from .optics import Optics
 from .paths import directions_at
 from .projection import Moments, Projection
+from .recording import Recordings
 from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
@@ -63,12 +63,42 @@ def solve(
         weights = arriving.copy()
         weights[-1] = 0.0
     shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
-    moments, sky, reflected = steps.finish(values, done, later, shares)
+    parts = steps.finish(values, done, later, shares)
+    return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
+
+
+def solve_again(
+    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, shares: list[Any], orders: int | None
+) -> Field:
+    """The same for values of the optics that carry derivatives, given the ``shares`` of a field that was solved:
+    nothing in here waits for a result."""
+    values = optics.values(resolution.degrees, resolution.phase_degree)
+    optics = optics.with_values(values)
+    steps = _Steps(optics, columns, grid, resolution)
+    done = steps.started(values, len(shares) + 1)
+    parts = steps.finished(values, done["reference"], done["first"], done["later"], shares)
+    return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
+
+
+def _field(
+    optics: Optics,
+    columns: SunColumns,
+    grid: Grid,
+    resolution: Resolution,
+    reference: Any,
+    parts: tuple[Any, ...],
+    shares: list[Any],
+    orders: int | None,
+) -> Field:
+    moments, sky, reflected = parts
     if orders == 1:
         reflected = 0.0 * reflected  # the reflection would be the second event
-    reference = Reference.of(grid, optics.channel_count, done["reference"])
-    degree, again = resolution.first_degree, orders != 1
-    return Field(optics, columns, grid, reference, degree, moments, sky, reflected, scatters=again)
+    reference = Reference.of(grid, optics.channel_count, reference)
+    field = Field(
+        optics, columns, grid, reference, resolution.first_degree, moments, sky, reflected, scatters=orders != 1
+    )
+    field.shares = shares
+    return field
 
 
 _always_traced = False
@@ -96,8 +126,7 @@ class _Steps:
     def __init__(self, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> None:
         self._optics, self._columns, self._grid, self._resolution = optics, columns, grid, resolution
         self._stages = [directions_at(grid, s.up, s.down) for s in resolution.stages]
-        self._recorded: dict[Any, Callable[..., Any]] = {}
-        self._used: set[Any] = set()
+        self._recordings = Recordings(grid)
 
     @classmethod
     def of(cls, optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution) -> _Steps:
@@ -108,7 +137,7 @@ class _Steps:
 
     def start(self, values: Any, count: int) -> dict[str, Any]:
         """Orders 1 to ``count``, the reference, and what the next order needs."""
-        return self._run(("start", count), lambda v: self._start(v, count), values)
+        return self._run(("start", count), lambda v: self.started(v, count), values)
 
     def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> tuple[Any, Any]:
         """Order ``n`` from the one before, and its probe."""
@@ -130,7 +159,7 @@ class _Steps:
         """What Field holds: moments, sky and reflected irradiance."""
         return self._run(
             ("finish", len(later)),
-            lambda v, reference, first, later, shares: self._finish(v, reference, first, later, shares),
+            lambda v, reference, first, later, shares: self.finished(v, reference, first, later, shares),
             values,
             done["reference"],
             done["first"],
@@ -141,21 +170,7 @@ class _Steps:
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
             return function(*arguments)
-        if key not in self._used:
-            self._used.add(key)
-            return function(*arguments)
-        if key not in self._recorded:
-            arrays = self._grid.arrays()
-            self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
-        # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
-        # collector has to wait.
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return self._recorded[key](*arguments)
-        finally:
-            if collects:
-                gc.enable()
+        return self._recordings.run(key, function, *arguments)
 
     def _stage(self, n: int) -> int:
         return min(n - 2, len(self._stages) - 1)
@@ -165,7 +180,8 @@ class _Steps:
         r = self._resolution
         return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
 
-    def _start(self, values: Any, count: int) -> dict[str, Any]:
+    def started(self, values: Any, count: int) -> dict[str, Any]:
+        """The same, traced."""
         optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
         suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
         project = Projection.at(grid, fine, *self._degree(1))
@@ -199,7 +215,10 @@ class _Steps:
         project = Projection.at(self._grid, self._stages[self._stage(n)], *self._degree(n))
         return project(gather(light), self._grid.shape[1], light.channels)
 
-    def _finish(self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
+    def finished(
+        self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]
+    ) -> tuple[Any, ...]:
+        """The same, traced."""
         optics, grid = self._optics.with_values(values), self._grid
         channels = optics.channel_count
         reference = Reference.of(grid, channels, reference)

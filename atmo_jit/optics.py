@@ -6,6 +6,7 @@ are opaque to the compiler, so that another atmosphere of the same make-up reuse
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from copy import copy
 from dataclasses import fields, replace
 from functools import cached_property, lru_cache
@@ -14,8 +15,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .atmosphere import Atmosphere, Constituent
-from .backend import channels, parameter, table
+from .atmosphere import Atmosphere
+from .backend import floats, parameter, table
+from .phase import CornetteShanks, HenyeyGreenstein, RayleighPhase
 from .profile import Exponential, Tabulated, Tent
 from .resolution import moments_of
 
@@ -24,7 +26,17 @@ PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 # Scale heights at which rays are cut: the field is asked once between two cuts.
 LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)
-_VALUES = ("radius", "thickness", "sun_radius", "solar", "albedo", "scattering", "extinction")
+_VALUES = (
+    "radius",
+    "thickness",
+    "sun_radius",
+    "solar",
+    "albedo",
+    "scattering",
+    "extinction",
+    "profiles",
+    "asymmetry",
+)
 
 
 class Optics:
@@ -32,35 +44,84 @@ class Optics:
 
     Attributes: ``radius``, ``thickness`` (m); ``solar``, ``albedo`` (lists of C Floats); ``scattering[k]``,
     ``extinction[k]`` (1/m) for constituent k; ``scatterers`` (indices of the constituents that scatter);
-    ``sun_radius`` (angular, radians).
+    ``sun_radius`` (angular, radians); ``profiles[k]``, ``asymmetry[k]``: numbers of its profile, and g of its phase
+    functions. ``scattering_too``: names of constituents that count as scatterers although none of their coefficients
+    is above 0.
     """
 
-    def __init__(self, atmosphere: Atmosphere, indices: np.ndarray) -> None:
+    radius: Any
+    thickness: Any
+    sun_radius: Any
+    solar: list[Any]
+    albedo: list[Any]
+    scattering: list[list[Any]]
+    extinction: list[list[Any]]
+    profiles: list[list[Any]]
+    asymmetry: list[list[Any]]
+
+    def __init__(
+        self, atmosphere: Atmosphere, indices: np.ndarray, scattering_too: Collection[str] = ()
+    ) -> None:
         self.atmosphere, self.indices = atmosphere, indices
         self.channel_count = len(indices)
         self.constituents = atmosphere.constituents
-        self.radius = parameter(atmosphere.bottom_radius_m)
-        self.thickness = parameter(atmosphere.thickness_m)
-        self.sun_radius = parameter(np.deg2rad(atmosphere.sun_angular_radius_deg))
-        self.solar = channels(atmosphere.solar_irradiance[indices])
-        self.albedo = channels(atmosphere.ground_albedo[indices])
-        self.scattering = [channels(c.scattering_per_m[indices]) for c in self.constituents]
-        self.extinction = [channels(c.extinction_per_m[indices]) for c in self.constituents]
         self.scatterers = [
-            k for k, c in enumerate(self.constituents) if c.phase is not None and np.any(c.scattering_per_m > 0)
+            k
+            for k, c in enumerate(self.constituents)
+            if c.phase is not None and (np.any(c.scattering_per_m > 0) or c.name in scattering_too)
         ]
         self.phase_tables: dict[int, Any] = {}
         self.moment_tables: dict[int, Any] = {}
-        self._profiles = [_with_parameters(c.profile) for c in self.constituents]
-        self._phases = [_phases(c, indices) for c in self.constituents]
+        vars(self).update(on_device(self.numbers(atmosphere)))
 
     @cached_property
     def make_up(self) -> tuple[Any, ...]:
         """What kernels depend on beside values: how many channels and which constituents scatter."""
         return self.channel_count, tuple(self.scatterers), len(self.constituents)
 
+    @property
+    def phase_kinds(self) -> tuple[Any, ...] | None:
+        """What kernels compile of the phase functions; None where they compile numbers, or tables of them."""
+        kinds = []
+        for c in self.constituents:
+            if c.phase is not None and not isinstance(c.phase, (HenyeyGreenstein, CornetteShanks, RayleighPhase)):
+                return None
+            kinds.append((type(c.phase), np.ndim(getattr(c.phase, "g", 0.0))))
+        return tuple(kinds)
+
+    def numbers(
+        self, atmosphere: Atmosphere, degrees: tuple[int, ...] = (), phase_degree: int | None = None
+    ) -> dict[str, Any]:
+        """The values (see ``values``) of an atmosphere of the same make-up, in double precision: numbers, arrays
+        [points] of tabulated profiles and [rows, columns] of phase tables."""
+        i = self.indices
+        parts = atmosphere.constituents
+        phases = [_distinct([c.phase.at(int(j)) for j in i] if c.phase else [])[0] for c in parts]
+        made: dict[str, Any] = {
+            "radius": atmosphere.bottom_radius_m,
+            "thickness": atmosphere.thickness_m,
+            "sun_radius": float(np.deg2rad(atmosphere.sun_angular_radius_deg)),
+            "solar": atmosphere.solar_irradiance[i].tolist(),
+            "albedo": atmosphere.ground_albedo[i].tolist(),
+            "scattering": [c.scattering_per_m[i].tolist() for c in parts],
+            "extinction": [c.extinction_per_m[i].tolist() for c in parts],
+            "profiles": [_numbers_of(c.profile) for c in parts],
+            "asymmetry": [[p.g for p in of_part if hasattr(p, "g")] for of_part in phases],
+        }
+        if phase_degree is not None:
+            made["phase_tables"] = {phase_degree: self._phase_series(atmosphere, phase_degree)}
+            made["moment_tables"] = {degree: self.scatterers_moments(degree, atmosphere) for degree in degrees}
+        return made
+
+    def by_channel(self, part: Any) -> np.ndarray:
+        """Sums over one entry of ``numbers``, of what belongs to each channel."""
+        if isinstance(part, dict):
+            return sum(table.sum(axis=0).reshape(-1, self.channel_count).sum(axis=0) for table in part.values())
+        rows = part if part and isinstance(part[0], list) else [part]
+        return sum((np.array(row) for row in rows if len(row) == self.channel_count), np.zeros(self.channel_count))
+
     def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
-        """Everything that a solve reads of an atmosphere beside its profiles, with phase moments up to ``degrees``."""
+        """Everything that kernels read of an atmosphere, with phase moments up to ``degrees``."""
         return {
             **{name: getattr(self, name) for name in _VALUES},
             "phase_tables": {phase_degree: self.phase_table(phase_degree)},
@@ -75,7 +136,9 @@ class Optics:
 
     def densities(self, h: Any) -> list[Any]:
         """Relative density of every constituent at altitude ``h`` (m)."""
-        return [profile.density(h) for profile in self._profiles]
+        return [
+            type(c.profile)(*numbers).density(h) for c, numbers in zip(self.constituents, self.profiles, strict=True)
+        ]
 
     def largest_extinction(self, densities: list[Any]) -> Any:
         """Extinction coefficient (1/m) of the most opaque channel."""
@@ -103,36 +166,43 @@ class Optics:
 
     def phase_values(self, constituent: int, nu: Any) -> list[Any]:
         """Phase function (1/sr) of a constituent per channel at the cosine ``nu`` of the scattering angle."""
-        phases = self._phases[constituent]
-        values = {id(p): p.value(nu) for p in phases}
-        return [values[id(p)] for p in phases]
+        phase = self.constituents[constituent].phase
+        phases, place = _distinct([phase.at(int(i)) for i in self.indices])
+        if self.asymmetry[constituent]:
+            phases = [replace(p, g=g) for p, g in zip(phases, self.asymmetry[constituent], strict=True)]
+        values = [p.value(nu) for p in phases]
+        return [values[i] for i in place]
 
     def phase_table(self, degree: int) -> Any:
         """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: table [node,
         scatterer x channel]."""
         if degree in self.phase_tables:
             return self.phase_tables[degree]
+        return table(self._phase_series(self.atmosphere, degree))
+
+    def _phase_series(self, atmosphere: Atmosphere, degree: int) -> np.ndarray:
         weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
-        chi = self._scatterers_moments(degree)
-        return table(_legendre_values(degree) @ (weights[:, None] * chi))
+        return _legendre_values(degree) @ (weights[:, None] * self.scatterers_moments(degree, atmosphere))
 
     def phase_moments(self, degree: int) -> Any:
         """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
-        return self.moment_tables[degree] if degree in self.moment_tables else table(self._scatterers_moments(degree))
+        if degree in self.moment_tables:
+            return self.moment_tables[degree]
+        return table(self.scatterers_moments(degree))
 
-    def _scatterers_moments(self, degree: int) -> np.ndarray:
-        columns = [m for k in self.scatterers for m in self._moments(k, degree)]
+    def scatterers_moments(self, degree: int, atmosphere: Atmosphere | None = None) -> np.ndarray:
+        """Legendre moments chi_l of the scatterers, or of those of an ``atmosphere`` like this: [l, scatterer x
+        channel]."""
+        atmosphere = atmosphere or self.atmosphere
+        phases = [atmosphere.constituents[k].phase for k in self.scatterers]
+        columns = [moments_of(phase.at(int(i)), degree) for phase in phases for i in self.indices]
         return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
 
-    def _moments(self, constituent: int, degree: int) -> list[np.ndarray]:
-        phase = self.constituents[constituent].phase
-        return [moments_of(phase.at(int(i)), degree) for i in self.indices]
-
-    @cached_property
+    @property
     def profiles_differentiable(self) -> bool:
-        """Whether a density profile carries derivatives: then nothing that depends on it can be kept."""
-        values = [getattr(p, f.name) for p in self._profiles if not isinstance(p, Tabulated) for f in fields(p)]
-        return any(dr.grad_enabled(value) for value in values)
+        """Whether a density profile, or the sun's size, carries derivatives: then nothing that depends on it can be
+        kept."""
+        return dr.grad_enabled(self.profiles, self.sun_radius)
 
     @cached_property
     def breaks_m(self) -> np.ndarray:
@@ -186,18 +256,28 @@ def _maximum(values: list[Any]) -> Any:
     return largest
 
 
-def _with_parameters(value: Any) -> Any:
-    """A profile or phase function with its plain numbers made kernel parameters."""
-    if isinstance(value, Tabulated):
-        return value
-    changes = {f.name: parameter(getattr(value, f.name)) for f in fields(value) if np.ndim(getattr(value, f.name)) == 0}
-    return replace(value, **changes)
+def on_device(numbers: Any) -> Any:
+    """Optics.numbers as what kernels read from memory."""
+    if isinstance(numbers, dict):
+        return {key: on_device(part) for key, part in numbers.items()}
+    if isinstance(numbers, list):
+        return [on_device(part) for part in numbers]
+    if isinstance(numbers, np.ndarray):
+        return floats(numbers) if numbers.ndim == 1 else table(numbers)
+    return parameter(numbers)
 
 
-def _phases(constituent: Constituent, indices: np.ndarray) -> list[Any]:
-    """One phase function per channel; the same object where channels share it."""
-    if constituent.phase is None:
-        return []
-    phases = [constituent.phase.at(int(i)) for i in indices]
-    made = {id(p): _with_parameters(p) if hasattr(p, "g") else p for p in phases}
-    return [made[id(p)] for p in phases]
+def _numbers_of(profile: Any) -> list[Any]:
+    """The numbers that a profile is made from."""
+    if isinstance(profile, Tabulated):
+        return [profile.altitude_m, profile.values]
+    return [getattr(profile, f.name) for f in fields(profile)]
+
+
+def _distinct(phases: list[Any]) -> tuple[list[Any], list[int]]:
+    """The phase functions that differ, and which of them is that of each channel."""
+    found: list[Any] = []
+    for phase in phases:
+        if not any(phase is other for other in found):
+            found.append(phase)
+    return found, [next(i for i, other in enumerate(found) if other is phase) for phase in phases]

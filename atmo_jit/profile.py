@@ -12,7 +12,7 @@ smooth: quadratures must be split there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -77,10 +77,13 @@ class Tabulated:
     An altitude given twice is a step, and the second of its values holds at that altitude.
 
     ``altitude_m`` (m, ascending, >= 0) and ``density`` (dimensionless, >= 0) are lists of one length; they are kept
-    as read-only float64 arrays in ``altitude_m`` and ``values``.
+    as read-only float64 arrays in ``altitude_m`` and ``values``. Dr.Jit arrays are taken as they are.
     """
 
-    def __init__(self, altitude_m: Sequence[float] | np.ndarray, density: Sequence[float] | np.ndarray) -> None:
+    def __init__(self, altitude_m: Any, density: Any) -> None:
+        if is_drjit(altitude_m):
+            self.altitude_m, self.values = altitude_m, density
+            return
         altitude = numbers(altitude_m, "altitude_m", NOT_NEGATIVE)
         values = numbers(density, "density", NOT_NEGATIVE)
         if len(altitude) != len(values):
@@ -109,10 +112,11 @@ class Tabulated:
     def density(self, h: Any) -> Any:
         """Relative density at altitude ``h`` (m)."""
         inside = piecewise_linear(h, self.altitude_m, self.values)
-        top = float(self.altitude_m[-1])
         if is_drjit(h):
-            return module_of(h).select(h > top, 0, inside)
-        return np.where(np.asarray(h) > top, 0.0, inside)
+            dr, altitude = module_of(h), self.altitude_m
+            top = dr.gather(type(h), altitude, len(altitude) - 1) if is_drjit(altitude) else float(altitude[-1])
+            return dr.select(h > top, 0, inside)
+        return np.where(np.asarray(h) > float(self.altitude_m[-1]), 0.0, inside)
 
     def to_dict(self) -> dict[str, Any]:
         """The keys of this profile in a constituent's JSON object."""

@@ -93,10 +93,15 @@ class Projection:
     def __call__(self, harmonics: Any, suns: int, channels: int) -> Moments:
         """``harmonics`` [K, D, room(suns), m x padded channels] -> moments and irradiance."""
         t, entries, count, size = types(), self.entries, self.count, padded(channels)
-        blocks, per_sun = room(suns) // TOGETHER, row_size((self.most + 1) * size) // size
-        lane = dr.arange(t.UInt, self.altitudes * entries * blocks)
-        block, rest = lane % blocks, lane // blocks
-        entry, k = rest % entries, rest // entries
+        lane = dr.arange(t.UInt, self.altitudes * entries * (room(suns) // TOGETHER))
+        # Sizes are read from memory: one kernel for all of them.
+        entries, blocks, per_sun, count = (
+            dr.opaque(t.UInt, v, 1)
+            for v in (entries, room(suns) // TOGETHER, row_size((self.most + 1) * size) // size, count)
+        )
+        rest = lane // blocks
+        k = rest // entries
+        block, entry = lane - rest * blocks, rest - k * entries
         first = (k * (count * blocks) + block) * (TOGETHER * per_sun) + dr.gather(t.UInt, self._m, entry)
 
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
@@ -108,6 +113,5 @@ class Projection:
             ]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(TOGETHER * channels)]
-        end = dr.opaque(t.UInt, count, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < end, add, max_iterations=-1, label="directions")
+        _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < count, add, max_iterations=-1, label="directions")
         return Moments(stored(sums, lane, len(sums)), self.degree, self.most, suns, channels)

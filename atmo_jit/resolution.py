@@ -67,8 +67,8 @@ class Resolution:
 
     @property
     def degrees(self) -> tuple[int, ...]:
-        """Degrees of phase moments that a solve asks for: one more than those of the moments of light."""
-        return tuple(sorted({self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
+        """Degrees of phase moments that are asked for: by a solve one more than those of the moments of light."""
+        return tuple(sorted({self.first_degree, self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
 
     @classmethod
     def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:

@@ -41,7 +41,7 @@ class Sunbeam:
 
         def beams() -> Any:
             lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
-            h = dr.gather(t.Float, floats(paths.levels), lane // self.COSINES)
+            h = dr.gather(t.Float, paths.kept("levels", lambda: floats(paths.levels)), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
             seen = visible_sun(optics, h, optics.radius + h, mu_s)
             return table_of([seen, *columns.toward(h, mu_s)], lane)
@@ -88,16 +88,18 @@ def first_order(optics: Optics, columns: SunColumns, grid: Grid, directions: Dir
 def beam_along(
     optics: Optics, beam: Sunbeam, paths: Paths, weights: PathWeights, theta: Any, azimuths: int
 ) -> tuple[Any, Any]:
-    """Sunlight scattered along the paths without the phase functions, a table [rays, suns, azimuths x scatterers x
-    channels], and light from the ground, [rays, suns, azimuths x channels]. ``theta`` [suns, 2]: cosine and sine of
-    the sun's zenith angle where the paths start."""
-    t = types()
+    """Sunlight scattered along the paths without the phase functions, a table [rays, suns, azimuths, scatterers x
+    channels], and light from the ground, [rays, suns, azimuths, channels]; ``azimuth_rows`` reads them. ``theta``
+    [suns, 2]: cosine and sine of the sun's zenith angle where the paths start."""
+    t, together = types(), azimuths_together(azimuths)
     channels, kinds = optics.channel_count, len(optics.scatterers)
-    suns = dr.width(theta) // 2
-    lane = dr.arange(t.UInt, len(paths.h) * suns)
-    sun, ray = lane % suns, lane // suns
+    suns, groups = dr.width(theta) // 2, azimuths // together
+    lane = dr.arange(t.UInt, len(paths.h) * suns * groups)
+    node = lane // groups
+    sun, ray = node % suns, node // suns
     mu_s, sin_s = packet(theta, sun, 2)
-    across = [sin_s * float(c) for c in np.cos(half_circle(azimuths))]
+    cosines = paths.grid.kept(("cosines", azimuths), lambda: floats(np.cos(half_circle(azimuths))))
+    across = [sin_s * c for c in packet(cosines, lane % groups, together)]
     device = paths.device
     start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
 
@@ -105,17 +107,23 @@ def beam_along(
         cos_turn, sin_turn = packet(device.turns, visit, 2)
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[list[Any]], _: list[list[Any]]) -> tuple[Any, ...]:
+    def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
         weight, level = row(weights.scattered, i, kinds * channels) if kinds else [], dr.gather(t.UInt, device.level, i)
         lights = [beam.at(level, mu) for mu in turned(i)]
         new = [
             [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
             for light, old in zip(lights, sums, strict=True)
         ]
-        return i + 1, new, lights
+        # As a sum, like all that derivatives pass backwards through such a loop.
+        ends = dr.select(i + 1 < stop, t.Float(0.0), 1.0)
+        last = [
+            [dr.fma(ends, value, s) for value, s in zip(light, old, strict=True)]
+            for light, old in zip(lights, last, strict=True)
+        ]
+        return i + 1, new, last
 
     def zeros(count: int) -> list[list[Any]]:
-        return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(azimuths)]
+        return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(together)]
 
     # Light at the last visit is that of the ground, where the path ends there.
     state = (start, zeros(kinds * channels), zeros(channels))
@@ -126,6 +134,18 @@ def beam_along(
         ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, light, strict=True)]
     scattered = [value for part in sums for value in part] or [t.Float(0.0)]
     return tuple(tables_of([scattered, ground], lane))
+
+
+def azimuths_together(azimuths: int) -> int:
+    """Azimuths that one lane of ``beam_along`` follows: they share the weights."""
+    return next(count for count in (4, 3, 2, 1) if azimuths % count == 0)
+
+
+def azimuth_rows(buffer: Any, node: Any, group: Any, azimuths: int, width: int) -> list[list[Any]]:
+    """Rows [width] of a group of azimuths of a table that ``beam_along`` made, for rays and suns ``node``."""
+    together = azimuths_together(azimuths)
+    values = row(buffer, node * (azimuths // together) + group, together * width)
+    return [values[i * width : (i + 1) * width] for i in range(together)]
 
 
 def _suns(grid: Grid) -> Any:
@@ -151,9 +171,12 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
 
     steps = grid.kept(("azimuths", azimuths, few), rule)
     width = kinds * channels
-    held = row(scattered, lane, few * width) if kinds else []
-    held, lit = [held[j::width] for j in range(width)], row(ground, lane, few * channels)
-    lit = [lit[j::channels] for j in range(channels)]
+
+    def by_azimuth(buffer: Any, size: int) -> list[tuple[Any, ...]]:
+        groups = (azimuth_rows(buffer, lane, i, few, size) for i in range(few // azimuths_together(few)))
+        return list(zip(*(values for group in groups for values in group), strict=True))
+
+    held, lit = by_azimuth(scattered, width) if kinds else [], by_azimuth(ground, channels)
     phases = optics.phase_table(r.phase_degree)
 
     def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
@@ -164,7 +187,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
             x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
             cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
             f = x - t.Float(cell)
-            low, high = row(phases, cell, width), row(phases, cell + 1, width)
+            low, high = (row(phases, cell + i, width, alone=True) for i in (0, 1))
             for i, part in enumerate(held):
                 glow = dr.maximum(_dot(taps, part), 0.0)
                 values[i % channels] = dr.fma(glow, dr.fma(f, high[i] - low[i], low[i]), values[i % channels])
@@ -224,5 +247,5 @@ def disc_cosine(mu_s: Any, radius: Any) -> Any:
     """
     x = dr.clip(mu_s / dr.maximum(radius, 1e-7), -1.0, 1.0)
     half = dr.safe_sqrt(1.0 - x * x)
-    part = x * (0.5 + (dr.asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
+    part = x * (0.5 + (dr.safe_asin(x) + x * half) * dr.inv_pi) + (2.0 / 3.0 * dr.inv_pi) * half * half * half
     return dr.select(dr.abs(x) < 1.0, radius * dr.maximum(part, 0.0), dr.maximum(mu_s, 0.0))

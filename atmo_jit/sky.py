@@ -10,8 +10,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -26,12 +27,17 @@ from .errors import InputError
 from .field import Field
 from .grid import Grid
 from .march import Rays, march, rays_to_boundary
-from .multiple_scattering import solve
+from .multiple_scattering import solve, solve_again
 from .optics import MAX_CHANNELS, Optics
+from .parameters import check_names
+from .pieces import Pieces, light_along
 from .resolution import Resolution
 from .single_scattering import ground_light, horizontal_irradiance
 from .views import check_views, side_by_side
 
+# Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
+# stand for those left out, carry none.
+SURE = 0.003
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
@@ -56,26 +62,9 @@ class RayLight:
 class _Band:
     """The solution at up to four wavelengths."""
 
-    def __init__(
-        self,
-        atmosphere: Atmosphere,
-        indices: np.ndarray,
-        resolution: Resolution,
-        orders: int | None,
-        tolerance: float,
-        suns: tuple[float, float] | None,
-        layout: Atmosphere,
-        held: dict[str, Any] | None = None,
-    ) -> None:
-        self.optics = Optics(atmosphere, indices)
-        grid = Grid.of(layout, resolution, suns)
-        if held is None:
-            self.columns = sun_columns(self.optics, grid)
-            self.field = solve(self.optics, self.columns, grid, resolution, orders, tolerance)
-        else:
-            self.columns = SunColumns(self.optics, resolution.columns, held["columns"])
-            self.field = Field.of(self.optics, self.columns, grid, resolution.first_degree, held, scatters=orders != 1)
-        self.source = self.field if self.field.scatters and self.optics.scatterers else None
+    def __init__(self, optics: Optics, columns: SunColumns, field: Field) -> None:
+        self.optics, self.columns, self.field = optics, columns, field
+        self.source = field if field.scatters and optics.scatterers else None
 
 
 class Sky:
@@ -86,7 +75,8 @@ class Sky:
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
     be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
     used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
-    :attr:`held` gave it for the same arguments; nothing is solved then. Raises AtmosphereError, LLVMError, InputError.
+    :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
+    orders are solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
     """
 
     def __init__(
@@ -98,9 +88,12 @@ class Sky:
         suns: tuple[float, float] | None = None,
         layout: Atmosphere | None = None,
         held: list[dict[str, Any]] | None = None,
+        *,
+        scattering_too: Collection[str] = (),
+        sure: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
-        layout = layout or self.atmosphere
+        self.layout = layout or self.atmosphere
         if orders is not None and (isinstance(orders, bool) or not isinstance(orders, int) or orders < 1):
             raise InputError(f"orders: is {orders!r}; must be a whole number >= 1, or None for all")
         if not 0.0 < tolerance < 1.0:
@@ -109,17 +102,45 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        some = held or [None] * len(bands)
-        self._bands = [
-            _Band(self.atmosphere, band, self.resolution, orders, tolerance, suns, layout, values)
-            for band, values in zip(bands, some, strict=True)
-        ]
+        remainder = SURE * tolerance if sure else tolerance
+        self._bands: list[_Band] = []
+        for band, values in zip(bands, held or [None] * len(bands), strict=True):
+            optics = Optics(self.atmosphere, band, scattering_too)
+            if values is None:
+                columns = sun_columns(optics, self.grid)
+                field = solve(optics, columns, self.grid, self.resolution, orders, remainder)
+            else:
+                columns = SunColumns(optics, self.resolution.columns, values["columns"])
+                degree = self.resolution.first_degree
+                field = Field.of(optics, columns, self.grid, degree, values, scatters=orders != 1)
+            self._bands.append(_Band(optics, columns, field))
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes that it is solved on."""
+        return Grid.of(self.layout, self.resolution, self.suns)
+
+    def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
+        """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
+        of orders (Field) of a sky that was solved, on the same nodes."""
+        other, other._bands = copy(self), []
+        for band, new, of_orders in zip(self._bands, values, shares, strict=True):
+            optics = band.optics.with_values(new)
+            columns = sun_columns(optics, self.grid)
+            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders)
+            other._bands.append(_Band(field.optics, columns, field))
+        return other
 
     @property
     def bands(self) -> list[_Band]:
         """The solution at up to four wavelengths each, its look-up tables made: what tables are baked from."""
         for band in self._bands:
             band.field.prepare()
+        return self._bands
+
+    @property
+    def solutions(self) -> list[_Band]:
+        """The same, as they are."""
         return self._bands
 
     @property
@@ -137,6 +158,7 @@ class Sky:
         *,
         ground: bool = True,
         sun_disc: bool = False,
+        pieces: list[Pieces | None] | None = None,
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
@@ -144,10 +166,12 @@ class Sky:
         views from far out in space exact; Float works too).
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
-        ``sun_angular_radius_deg`` (nothing for a point sun).
+        ``sun_angular_radius_deg`` (nothing for a point sun). ``pieces``: those of the rays (pieces.Pieces), per band;
+        derivatives then pass through.
         """
         given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
-        if all(isinstance(v, np.ndarray) and v.shape == (len(given[0]),) for v in given):
+        usual = pieces is None and all(isinstance(v, np.ndarray) and v.ndim == 1 for v in given)
+        if usual and len({v.size for v in given}) == 1:
             air = self.atmosphere
             order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
             light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
@@ -155,10 +179,13 @@ class Sky:
         rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
-        for band in self._bands:
+        for i, band in enumerate(self._bands):
             optics = band.optics
             band.field.prepare()
-            light = march(optics, band.columns, rays, source=band.source)
+            if pieces is None:
+                light = march(optics, band.columns, rays, source=band.source)
+            else:
+                light = light_along(optics, band.columns, rays, pieces[i], source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
                 light.single[c] = light.single[c] + light.multiple[c]
@@ -278,7 +305,8 @@ class SkyResult:
 
     ``radiance`` (W m^-2 sr^-1 nm^-1 for the atmosphere's solar irradiance; 1/sr where that is 1), ``transmittance``
     along the ray, ``sun_irradiance`` and ``sky_irradiance`` on a horizontal surface at the observer (W m^-2 nm^-1);
-    ``meta``: version, seconds, tolerance, orders, method and the plan (resolution) of the solve.
+    ``meta``: version, seconds, tolerance, orders, method and the plan (resolution) of the solve. ``gradient``: the
+    derivatives that were asked for, by name (derivatives.Linearization.gradients).
     """
 
     radiance: np.ndarray
@@ -286,6 +314,7 @@ class SkyResult:
     sun_irradiance: np.ndarray
     sky_irradiance: np.ndarray
     meta: dict[str, Any]
+    gradient: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def sky(
@@ -297,6 +326,7 @@ def sky(
     ground: bool = True,
     sun_disc: bool = False,
     method: str = "auto",
+    gradient: Sequence[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> SkyResult:
     """Radiance, transmittance and irradiances for a list of views.
@@ -306,15 +336,17 @@ def sky(
     one length N (see atmo_jit.views). ``orders``: scattering and reflection events counted (None: all, to
     ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the sun's.
     ``method``: "march" integrates every ray, "tables" interpolates them where a table serves, "auto" takes tables where
-    they pay and keep the tolerance. ``progress`` is called with the fraction done.
+    they pay and keep the tolerance. ``gradient``: names of parameters by which the radiance is differentiated
+    (parameters.parameter_names has them all). ``progress`` is called with the fraction done.
 
-    Raises InputError for views, orders, tolerance or method that are not allowed, AtmosphereError for a bad
+    Raises InputError for views, orders, tolerance, method or names that are not allowed, AtmosphereError for a bad
     atmosphere, LLVMError without a usable LLVM.
     """
     if method not in METHODS:
         raise InputError(f"method: is {method!r}; must be one of {', '.join(METHODS)}")
     air = Atmosphere.load(atmosphere)
     checked = check_views(views)
+    names = check_names(air, gradient, checked)
     start = time.perf_counter()
     solved = Sky(air, orders, tolerance)
     solve_seconds = time.perf_counter() - start
@@ -330,6 +362,12 @@ def sky(
         arrays, done = evaluate(
             solved, checked, method=method, tolerance=tolerance, ground=ground, sun_disc=sun_disc, march=by_march
         )
+    derivatives = {}
+    if names:
+        from .derivatives import Linearization  # builds on this module
+
+        options = {"tolerance": tolerance, "orders": orders, "ground": ground, "sun_disc": sun_disc}
+        derivatives = Linearization(air, checked, **options).gradients(names)
     meta = {
         "atmo_jit": __version__,
         "seconds": time.perf_counter() - start,
@@ -340,7 +378,7 @@ def sky(
         "wavelengths_nm": air.wavelengths_nm.tolist(),
         "plan": asdict(solved.resolution),
     }
-    return SkyResult(*arrays, meta)
+    return SkyResult(*arrays, meta, derivatives)
 
 
 def _march(

@@ -26,15 +26,15 @@ How good three wavelengths are otherwise (680, 550, 440 nm; tests/plugins/test_s
 masses is right within 5 % of its brightest channel, the sun's red is 2 % too bright at 1 air mass and 27 % at 10,
 because transmittance is convex in between and the ozone band at 600 nm is missed. Ten wavelengths are right within 2 %.
 
-Colour matching functions, the solar spectrum and the sRGB matrix come from colour-science, imported on first use.
+Colour matching functions, the solar spectrum and the sRGB matrix are colour-science's, held in a file of their own:
+importing that package takes longer than a picture.
 """
 
 from __future__ import annotations
 
-import sys
-import warnings
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,23 +55,14 @@ __all__ = [
 VISIBLE_NM = (360.0, 830.0)  # Mitsuba's range of wavelengths, and that of the colour matching functions
 SMOOTHING_NM = 10  # below this the Fraunhofer lines would make single wavelengths bad anchors of the spectrum
 SOLAR_RANGE_NM = (280.0, 4000.0)
+DATA = Path(__file__).with_name("spectrum.npz")
 
 
 @cache
-def _colour() -> Any:
-    """The package colour-science.
-
-    Where matplotlib is not installed it says so in a warning and puts mocks of it into ``sys.modules``, which would
-    make others believe that matplotlib is there: no plot is drawn here, so both are undone.
-    """
-    present = set(sys.modules)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    for name in set(sys.modules) - present:
-        if type(sys.modules[name]).__name__ == "MagicMock":
-            del sys.modules[name]
-    return colour
+def _data() -> dict[str, np.ndarray]:
+    """Tables of colour-science: see bench/spectra.py."""
+    with np.load(DATA, allow_pickle=False) as held:
+        return {name: held[name] for name in held.files}
 
 
 # XYZ (normalised as below) of light under the Earth's sun, from its radiance over the sun's irradiance at a few
@@ -94,14 +85,13 @@ FAST_NM = {len(nm): nm for nm in FITTED}  # by their number
 @cache
 def cie_1931() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths (nm, [471]) and the CIE 1931 2 degree colour matching functions x, y, z there ([471, 3])."""
-    functions = _colour().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    return _frozen(functions.wavelengths), _frozen(functions.values)
+    return _frozen(_data()["cie_1931_nm"]), _frozen(_data()["cie_1931"])
 
 
 @cache
 def xyz_to_srgb() -> np.ndarray:
     """The [3, 3] matrix from CIE XYZ to linear sRGB (IEC 61966-2-1)."""
-    return _frozen(_colour().RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
+    return _frozen(_data()["xyz_to_srgb"])
 
 
 WHITES = {"D65": (0.3127, 0.3290), "ACES": (0.32168, 0.33767)}
@@ -148,10 +138,7 @@ def xyz_to_rgb(space: str) -> np.ndarray:
 @cache
 def _smooth_solar() -> tuple[np.ndarray, np.ndarray]:
     """ASTM G173-03 extraterrestrial irradiance at whole nanometres, as a running mean over SMOOTHING_NM."""
-    _colour()
-    from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
-
-    data = np.array(sorted(DATA_ASTMG173_ETR.items()), dtype=np.float64)
+    data = _data()["astm_g173"]
     step = 0.5  # the finest sampling in the data
     fine = np.arange(SOLAR_RANGE_NM[0], SOLAR_RANGE_NM[1] + step, step)
     integral = np.concatenate([[0.0], np.cumsum(np.convolve(np.interp(fine, *data.T), [0.5, 0.5], "valid") * step)])

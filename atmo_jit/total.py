@@ -7,13 +7,17 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, row_size, table_of, types, uints
+from .backend import evaluated, floats, row_size, table_of, types, uints
 from .column import SunColumns
 from .grid import Grid
 from .harmonics import pair_count, pair_index, pairs
 from .optics import Optics
 from .projection import Moments
 from .refinement import Reference, Taps
+
+# Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
+# derivative of a quotient, which has a square below the line, must not leave single precision.
+DARK = 1e-16
 
 
 def total_of(
@@ -50,7 +54,7 @@ def total_of(
     dr.scatter(moments, total, (node * entries + entry) * channels + channel, entry < entries)
     dr.scatter(reflected, total, node * channels + channel, entry == entries)
     dr.scatter(sky, total, node * channels + channel, entry == entries + 1)
-    dr.eval(moments, reflected, sky)
+    moments, reflected, sky = evaluated([moments, reflected, sky])
     return moments, _over(grid, sky, per_depth, channels), _over(grid, reflected, per_depth, channels)
 
 
@@ -98,14 +102,13 @@ def _rest(
             if order.degree not in fading:
                 fading[order.degree] = _fading(optics, l_, order.degree, first.degree, channel)
             size = ((dr.minimum(l_, order.degree) * altitudes + k) * suns + sun) * channels + channel
-            peak = sharp * dr.gather(t.Float, _peak(grid, first, order), size)
+            peak = sharp * dr.gather(t.Float, _peak(grid, reference, first, order), size)
             for _ in range(events):
                 peak = peak * fading[order.degree]
             value = dr.select(held, value, peak)
         total = dr.fma(value, weight, total)
     total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    dr.eval(total)
-    return total
+    return evaluated(total)
 
 
 def _fading(optics: Optics, l_: Any, degree: int, highest: int, channel: Any) -> Any:
@@ -124,7 +127,7 @@ def _fading(optics: Optics, l_: Any, degree: int, highest: int, channel: Any) ->
     return dr.select(low > 0.0, dr.clip(high / dr.select(low > 0.0, low, 1.0), 0.0, 1.0), 0.0)
 
 
-def _peak(grid: Grid, first: Moments, order: Moments) -> Any:
+def _peak(grid: Grid, reference: Reference, first: Moments, order: Moments) -> Any:
     """r_l of an order's forward peak, [l, K, S, channels]."""
     t, channels, (altitudes, suns) = types(), first.channels, grid.shape
     lane = dr.arange(t.UInt, (order.degree + 1) * altitudes * suns * channels)
@@ -133,20 +136,20 @@ def _peak(grid: Grid, first: Moments, order: Moments) -> Any:
     sun = dr.maximum(sun, int(grid.whole_suns))  # under the zenith light has m = 0 alone: the next sun's ratio holds
     k, l_ = node % altitudes, node // altitudes
     product, square = 0.0, 0.0
+    scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
     for m in range(min(order.most, 1), order.most + 1):
         held = l_ >= m
         # Places of (l, m) are consecutive in l.
         a, b = (
-            dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
+            scale * dr.gather(t.Float, light.values, light.index(k, l_ - m + start, there, channel), held)
             for light, there, start in (
                 (first, sun * grid.first, pair_index(first.degree, m, m)),
                 (order, sun, pair_index(order.degree, m, m)),
             )
         )
         product, square = dr.fma(a, b, product), dr.fma(a, a, square)
-    size = dr.select(square > 0.0, dr.maximum(product, 0.0) / dr.select(square > 0.0, square, 1.0), 0.0)
-    dr.eval(size)
-    return size
+    lit = square > DARK
+    return evaluated(dr.select(lit, dr.maximum(product, 0.0) / dr.select(lit, square, 1.0), 0.0))
 
 
 def _degrees(grid: Grid, degree: int) -> Any:
@@ -196,6 +199,4 @@ def _over(grid: Grid, irradiance: Any, per_depth: Any, channels: int) -> Any:
     level = lane // width
     near, far = (dr.maximum(over(dr.opaque(t.UInt, altitudes - 1 - n, 1)), 1e-30) for n in (1, 2))
     steady = near * dr.clip(near / far, 0.25, 4.0)
-    quotient = dr.select(level >= altitudes - 1, steady, over(level))
-    dr.eval(quotient)
-    return quotient
+    return evaluated(dr.select(level >= altitudes - 1, steady, over(level)))

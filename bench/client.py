@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from bench import browser
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path(__file__).with_name("client_page.html")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT, FOV_DEG = 160, 96, 60.0
 KINDS = {".js": "text/javascript", ".mjs": "text/javascript", ".html": "text/html", ".json": "application/json"}
 
@@ -79,8 +80,8 @@ VIEWS = (
 
 def missing() -> str | None:
     """What is not installed, None where everything is."""
-    if not any(map(shutil.which, BROWSERS)):
-        return f"no Chromium ({', '.join(BROWSERS)})"
+    if browser.missing():
+        return browser.missing()
     if not (packages() / "@takram" / "three-atmosphere").is_dir():
         return f"no @takram/three-atmosphere below {packages()} (make client)"
     return None
@@ -199,12 +200,10 @@ def _server(content: dict[str, bytes], folders: dict[str, Path], results: Any) -
 
 @contextmanager
 def _browser(address: str) -> Iterator[None]:
-    program = next(filter(None, map(shutil.which, BROWSERS)))
+    program = next(filter(None, map(shutil.which, browser.PROGRAMS)))
     with tempfile.TemporaryDirectory(prefix="atmo-jit-client-", ignore_cleanup_errors=True) as profile:
-        flags = ["--headless=new", "--no-sandbox", "--no-first-run", "--disable-dev-shm-usage", "--disable-extensions"]
-        flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
         process = subprocess.Popen(
-            [program, *flags, f"--user-data-dir={profile}", address],
+            [program, *browser.FLAGS, f"--user-data-dir={profile}", address],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )

@@ -14,9 +14,7 @@ factor that gives the truth half the luminance of white.
 from __future__ import annotations
 
 import argparse
-import warnings
 from collections.abc import Sequence
-from functools import cache
 from itertools import combinations
 from typing import Any
 
@@ -28,6 +26,7 @@ from atmo_jit.earth import AEROSOLS, earth_at
 from atmo_jit.spectrum import FITTED, SpectralBasis, solar_irradiance
 
 from .page import table
+from .spectra import colour_science
 
 GRID_NM = np.arange(380.0, 771.0, 10.0)
 PRESET_NM = (680.0, 550.0, 440.0)
@@ -38,14 +37,6 @@ TRAINING, HELD_OUT = 1, 2  # seeds
 SHORTLIST = 200
 NOISE = 0.003  # relative error of each radiance that a matrix has to bear
 VIEWS = 150  # of each atmosphere
-
-
-@cache
-def _colour() -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    return colour
 
 
 def skies(seed: int, atmospheres: int, views: int) -> dict[str, np.ndarray]:
@@ -88,7 +79,7 @@ def shown(xyz: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def difference(xyz: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """CIE Delta E 2000 [N] between colours under that exposure."""
-    colour = _colour()
+    colour = colour_science()
     lab = [colour.XYZ_to_Lab(shown(v, truth), WHITE_XY) for v in (xyz, truth)]
     return np.asarray(colour.delta_E(*lab, method="CIE 2000"))
 

@@ -81,7 +81,6 @@ def rays() -> dict[str, float]:
             continue
         solved = OwnSky(air, 0.01)
         columns = columns_of(random_views(VIEWS))
-        dr.eval(columns)
 
         def evaluate(columns: list[Any] = columns, solved: OwnSky = solved) -> None:
             dr.eval(solved.sky.rays(*columns).radiance)

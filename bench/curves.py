@@ -118,7 +118,6 @@ def views(air: Atmosphere, most: int, repeats: int) -> dict[str, Any]:
     rows, count = [], 100
     while count <= most:
         columns = columns_of(random_views(count))
-        dr.eval(columns)
 
         def evaluate(columns: list[Any] = columns) -> None:
             dr.eval(solved.sky.rays(*columns).radiance)

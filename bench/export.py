@@ -1,13 +1,18 @@
 """A client's pictures against the solution: with the tables that `atmo-jit export` writes, and with its own.
 
-``python -m bench.export`` prints the tables of docs/export.md. Needs what :mod:`.client` needs.
+``python -m bench.export`` prints the tables of docs/export.md; needs what :mod:`.client` needs. ``--time``: seconds of
+whole processes, by layout.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
+import subprocess
+import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +20,7 @@ import numpy as np
 from atmo_jit import mapping
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
-from atmo_jit.export import TEXELS, Options, export
+from atmo_jit.export import LAYOUTS, TEXELS, Options, export
 from atmo_jit.sky import Sky
 from bench import client
 from bench.client import View
@@ -27,7 +32,10 @@ SUNS_DEG = (20.0, 60.0, 80.0, 85.0, 87.0, 88.0, 89.0, 90.0, 91.0, 92.0, 93.0, 94
 def main() -> None:
     """Print errors by view and by the sun's height."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.parse_args()
+    parser.add_argument("--time", action="store_true", help="Seconds of whole processes, by layout.")
+    if parser.parse_args().time:
+        times()
+        return
     reason = client.missing()
     if reason is not None:
         raise SystemExit(f"bench.export: {reason}")
@@ -45,6 +53,27 @@ def main() -> None:
         exact, fitted, shipped = (quantiles(errors[name, view.name])[:2] for name in (*TEXELS, "shipped"))
         cells = [f"{100 * v:.3g}" for v in (*exact, *fitted, *shipped)] + [f"{shipped[0] / fitted[0]:.2g}"]
         print(f"| {view.name} | {' | '.join(cells)} |")
+
+
+def times(count: int = 5) -> None:
+    """Print wall and processor seconds of `atmo-jit export`, start of the process and reading back included: medians of
+    ``count`` runs after a first one, which fills Dr.Jit's cache of kernels."""
+    print("| layout | wall s | CPU s | MiB |\n|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for layout in LAYOUTS:
+            out = Path(folder) / layout
+            command = [sys.executable, "-m", "atmo_jit", "export", "--atmosphere", "earth", "--layout", layout]
+            runs = [_seconds([*command, "--out", str(out), "--quiet"]) for _ in range(count + 1)][1:]
+            wall, cpu = (f"{np.median(v):.2f}" for v in zip(*runs, strict=True))
+            size = sum(file.stat().st_size for file in out.iterdir()) / 2**20
+            print(f"| {layout} | {wall} | {cpu} | {size:.1f} |")
+
+
+def _seconds(command: list[str]) -> tuple[float, float]:
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def pictures(air: Atmosphere, views: tuple[View, ...]) -> dict[tuple[str, str], np.ndarray]:

@@ -16,6 +16,7 @@ JSON holds::
         cost     for ``atmosphere``: cold, cached, warm (each wall_s and cpu_s), peak_mib, solution_bytes (bench.cost)
     own_on_few   error rows of this package on the few cases that slow methods are asked for
     stages       solve, rays: rows as from bench.limits.stages
+    tables       what it costs to make tables and to read pictures from them: rows as from bench.tables.times
     peers        rows as from bench.peers
     curves       resolution, wavelengths, views, threads (bench.curves)
     skipped      what was not measured, and why
@@ -39,7 +40,7 @@ from .methods import DEFAULT_TOLERANCE, METHODS, Method, method_of
 from .truth import FEW_CASES, Truth
 
 SCHEMA = 2
-PARTS = ("frontier", "stages", "peers", "curves")
+PARTS = ("frontier", "stages", "tables", "peers", "curves")
 # What --quick keeps: the settings that say most, and what takes seconds.
 QUICK = {"atmo-jit": ("tolerance 0.01",), "hillaire2020": ("size 1",)}
 Advance = Callable[[float], None]
@@ -90,6 +91,13 @@ def measure(
     if "stages" in parts:
         result["stages"] = _stages(atmosphere, machine, quick)
         advance(0.65)
+    if "tables" in parts:
+        from . import tables
+
+        if quick:
+            skipped.append({"what": "tables", "reason": "--quick"})
+        else:
+            result["tables"] = list(tables.times(atmosphere))
     if "peers" in parts:
         from . import peers
 

@@ -45,6 +45,12 @@ Each stage is a kernel, named by its loops. The ratio is its time over what its 
 at this machine's measured limits: {march:.0f} million march steps (a square root and two exponentials) and
 {gather:.0f} million gathers of four floats per second. Neighbouring lanes that read the same address bring it below 1.
 """
+TABLES = """## Tables
+
+Making tables from a solved `{atmosphere}`, and pictures of 1280 x 720 pixels from them in memory: medians with warm
+kernels. "As planned" is what `atmo-jit plan` builds for one observer and one sun: only the suns that matter are solved.
+How far tables are from the solution is in docs/method.md. CPU time counts threads that wait, too.
+"""
 PEERS = """## Peers in the same run
 """
 SKIPPED = """## Not measured
@@ -56,7 +62,7 @@ def page(result: Mapping[str, Any], picture: str | None = None) -> str:
     parts = [HEAD.format(**result, **result["machine"])]
     if picture:
         parts.append(f"![95th percentile of the error over CPU seconds]({picture})\n")
-    parts += [section for section in (_frontier(result), _stages(result), _peers(result)) if section]
+    parts += [section for section in (_frontier(result), _stages(result), _tables(result), _peers(result)) if section]
     if "curves" in result:
         from .curves import section
 
@@ -170,6 +176,13 @@ def _stages(result: Mapping[str, Any]) -> str:
     return "\n".join(text)
 
 
+def _tables(result: Mapping[str, Any]) -> str:
+    if "tables" not in result:
+        return ""
+    heads = {"what": "what", "wall_ms": "wall ms", "cpu_ms": "CPU ms"}
+    return "\n".join([TABLES.format(**result), _table(result["tables"], heads)])
+
+
 def _peers(result: Mapping[str, Any]) -> str:
     rows = result.get("peers", ())
     if not rows:
@@ -212,7 +225,8 @@ def main(arguments: list[str]) -> int:
     *sources, page_name = arguments
     result, *more = (json.loads(Path(source).read_text(encoding="utf-8")) for source in sources)
     for later in more:
-        result |= {part: later[part] for part in ("frontier", "own_on_few", "peers", "curves") if part in later}
+        parts = ("frontier", "own_on_few", "tables", "peers", "curves")
+        result |= {part: later[part] for part in parts if part in later}
         # Stages are measured against the limits of the same run.
         result |= {part: later[part] for part in ("stages", "machine") if "stages" in later}
     target = Path(page_name)

@@ -68,12 +68,10 @@ class OwnSky:
         return np.stack([np.broadcast_to(v.numpy(), shape) for v in light.radiance], axis=-1)
 
 
-def columns_of(views: Mapping[str, np.ndarray]) -> list[Any]:
-    """Views (degrees) as the arguments of ``Sky.rays``: altitude and three angles in radians, Float64."""
-    from atmo_jit.backend import doubles
-
+def columns_of(views: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Views (degrees) as the arguments of ``Sky.rays``: altitude and three angles in radians."""
     angles = (np.deg2rad(views[name]) for name in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg"))
-    return [doubles(views["altitude_m"]), *(doubles(angle) for angle in angles)]
+    return [np.asarray(views["altitude_m"], float), *angles]
 
 
 def scaled(resolution: Any, factor: float) -> Any:

@@ -23,10 +23,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from .cost import timed
 
 Row = dict[str, object]
 
@@ -90,17 +91,6 @@ def whole_processes(atmosphere: str = "earth", repeats: int = 3) -> list[Row]:
     return rows
 
 
-def timed(work: Callable[[], None], repeats: int = 7) -> tuple[float, float]:
-    """Median (wall, CPU) seconds of ``work`` after one call that is not counted."""
-    work()
-    runs = []
-    for _ in range(repeats):
-        cpu, wall = time.process_time(), time.perf_counter()
-        work()
-        runs.append((time.perf_counter() - wall, time.process_time() - cpu))
-    return tuple(statistics.median(run[i] for run in runs) for i in (0, 1))
-
-
 def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
     """Warm solve, solve of an atmosphere that changes each time, and evaluation of many rays."""
     import drjit as dr
@@ -127,8 +117,7 @@ def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
         ("solve", lambda: solve(atmosphere)),
         ("solve, new atmosphere each time", lambda: solve(another())),
     ):
-        wall, cpu = timed(work)
-        rows.append({"scene": "all suns and altitudes, 3 wavelengths", "what": what, "wall_s": wall, "cpu_s": cpu})
+        rows.append({"scene": "all suns and altitudes, 3 wavelengths", "what": what, **timed(work, 7)})
     solved = solve(atmosphere)
     for scene, fixed in SCENES.items():
         views = random_views(rays, **fixed)
@@ -136,15 +125,13 @@ def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
             views["altitude_m"],
             *(np.radians(views[f"{k}_deg"]) for k in ("sun_zenith", "view_zenith", "azimuth")),
         ]
-        inputs = [Float(part.astype(np.float32)) for part in angles]
-        dr.eval(inputs)
 
-        def evaluate(inputs: list[Float] = inputs) -> None:
+        def evaluate(inputs: list[np.ndarray] = angles) -> None:
             dr.eval(solved.rays(*inputs).radiance)
             dr.sync_thread()
 
-        wall, cpu = timed(evaluate, repeats=3)
-        rows.append({"scene": scene, "what": f"{rays:,} rays", "wall_s": wall, "cpu_s": cpu, "rays_per_s": rays / wall})
+        cost = timed(evaluate, 3)
+        rows.append({"scene": scene, "what": f"{rays:,} rays", **cost, "rays_per_s": rays / cost["wall_s"]})
     return rows
 
 

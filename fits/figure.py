@@ -60,7 +60,7 @@ def draw(fit: Fit, result: dict[str, Any], path: str | Path) -> None:
     )
     rows[1, 2].axhline(0.0, color="black", linewidth=0.5)
     rows[1, 2].set(xlabel="wavelength, nm" if data.mixing is None else "channel", ylabel="mean and rms residual, %")
-    text = [f"{name} = {value:.4g}" for name, value in list(fit.values.items())[:6]]
+    text = [f"{name} = {value:.4g}" for name, value in list(fit.values.items())[:4]]
     figure.suptitle("   ".join(text), fontsize=8)
     figure.savefig(path, dpi=110, format="png")
 

@@ -18,11 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from atmo_jit.errors import InputError
+from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
+from .forward import ROUGH
 from .observations import Observations
-from .optimise import STEP_TOLERANCE, Residuals, Solution, minimise
+from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 
@@ -31,6 +33,9 @@ UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 RESTARTS = 3
+ROUNDS = 12  # of loss and weights, each of
+FIRST_ITERATIONS = 4
+STEPS_FORESEEN = 3
 MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
 LEAST_CLUSTERS = 6  # from which a scatter of means is known
 FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
@@ -73,22 +78,22 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     samples = int(np.count_nonzero(data.used))
     whole = Problem.of(replace(config, atmosphere=air), data)
     _check_count(whole, samples)
-    whole.model.place(whole.atmosphere_values(whole.start))
-    rows = _some(data, FEW)
-    _check_units(whole.part(rows))
+    few = _few(whole)
+    few.model.place(few.atmosphere_values(few.start))
+    _check_units(few)
     report = _Report(progress)
     tries = []
-    for start in _starting_points(whole):
-        tries.append(_minimum(whole, rows, start, report))
-        problem, u, solution = tries[-1]
-        if solution.converged and not _poor(problem, u):
+    for start in _starting_points(few):
+        tries.append(_minimum(few, start, report))
+        if tries[-1].solution.converged and not _poor(tries[-1]):
             break
         if len(tries) > RESTARTS:
             break
     # Poor ends are compared by their residuals, whose scale does not change with the loss.
-    problem, u, solution = min(tries, key=lambda end: _scale(end[0].evaluate(end[1])))
-    problem, u, solution = _polished(whole, u, report)
-    found = problem.evaluate(u, jacobian=True)
+    best = min(tries, key=lambda end: _scale(end.left))
+    end = _polished(whole, whole.spread(few, best.solution.u), report)
+    problem, u, solution = end.problem, end.solution.u, end.solution
+    found = replace(problem.evaluate(u), jacobian=solution.jacobian)
     errors = uncertainty(problem, u, found)
     masked = everything.part(np.flatnonzero(~everything.used.any(axis=1)))
     unseen = None
@@ -111,55 +116,83 @@ class _Report:
             self._progress(1.0 - self._left)
 
 
-End = tuple[Problem, np.ndarray, Solution]
+@dataclass(frozen=True)
+class _End:
+    """Where a minimisation ended, and of what."""
+
+    problem: Problem
+    solution: Solution
+
+    @property
+    def left(self) -> np.ndarray:
+        """Residuals over sigma of the samples in use."""
+        return self.problem.evaluate(self.solution.u).raw[self.problem.data.used]
 
 
-def _minimum(whole: Problem, rows: np.ndarray, start: np.ndarray, report: _Report) -> End:
-    """The minimum for some of the samples from one start; with its problem."""
-    u = start
-    for _ in range(3):
-        if whole.model.strays(whole.atmosphere_values(u)) or u is start:
-            whole.model.place(whole.atmosphere_values(u))
-        problem = whole.part(rows)
-        problem = problem.with_loss(*_loss(problem, u, first=u is start))
-        solution = _solve(problem, u, report, FIRST_TOLERANCE)
+def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
+    """The minimum for some of the samples from one start; with a loss and weights that suit what is left there."""
+    u, before = start, 0.0
+    for _ in range(ROUNDS):
+        if few.model.strays(few.atmosphere_values(u)):
+            few.model.place(few.atmosphere_values(u))
+        problem = _weighed(few, u)
+        solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS)
         u = solution.u
-        excess = _loss(problem, u)[1]
-        if 0.7 < excess / problem.excess < 1.4 and not whole.model.strays(whole.atmosphere_values(u)):
+        if solution.converged and 0.7 < before / problem.excess < 1.4:
             break
-    return problem, u, solution
+        before = problem.excess
+    return _End(problem, solution)
 
 
-def _polished(whole: Problem, u: np.ndarray, report: _Report) -> End:
+def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
     """The minimum for all samples, on nodes for the atmosphere at ``u``."""
     whole.model.place(whole.atmosphere_values(u))
-    problem = whole.with_loss(*_loss(whole, u))
+    problem = _weighed(whole, u)
     last = _solve(problem, u, report, STEP_TOLERANCE)
-    return problem, last.u, replace(last, iterations=report.iterations)
+    return _End(problem, replace(last, iterations=report.iterations))
 
 
-def _solve(problem: Problem, u: np.ndarray, report: _Report, step_tolerance: float) -> Solution:
+def _weighed(problem: Problem, u: np.ndarray) -> Problem:
+    """The problem with loss and weights for the residuals that a step from ``u`` will leave.
+
+    Those at u may be far larger; with their weights priors would decide.
+    """
+    raw = problem.evaluate(u).raw[problem.data.used]
+    weighed = problem.with_loss(*_weights(problem, raw))
+    for _ in range(STEPS_FORESEEN):
+        at = weighed.evaluate(u, jacobian=True)
+        step = -np.linalg.lstsq(at.jacobian.T @ at.jacobian, at.jacobian.T @ at.residual, rcond=1e-12)[0]
+        weighed = problem.with_loss(*_weights(problem, raw + problem.raw_jacobian(u) @ step))
+    return weighed
+
+
+def _solve(
+    problem: Problem, u: np.ndarray, report: _Report, enough: float, iterations: int = MAX_ITERATIONS
+) -> Solution:
     functions = Residuals(
         lambda u: problem.evaluate(u).residual, lambda u: problem.evaluate(u, jacobian=True).jacobian
     )
     return minimise(
-        functions, u, method=problem.config.optimiser, step_tolerance=step_tolerance, progress=report
+        functions,
+        u,
+        method=problem.config.optimiser,
+        max_iterations=iterations,
+        step_tolerance=enough,
+        progress=report,
     )
 
 
-def _scale(found: Evaluation) -> float:
+def _scale(raw: np.ndarray) -> float:
     """Robust standard deviation of the residuals over sigma."""
-    return 1.4826 * float(np.nanmedian(np.abs(found.raw)))
+    return 1.4826 * float(np.median(np.abs(raw)))
 
 
-def _loss(problem: Problem, u: np.ndarray, first: bool = False) -> tuple[float, float]:
-    """d of the loss and the excess of the residuals at ``u``; at a start, which may be anywhere, no excess."""
-    found = problem.evaluate(u)
-    scale = _scale(found)
+def _weights(problem: Problem, raw: np.ndarray) -> tuple[float, float]:
+    """d of the loss and the excess for residuals over sigma of the samples in use."""
+    scale = _scale(raw)
     huber = HUBER * max(1.0, scale) if problem.config.robust else np.inf
-    raw = found.raw[problem.data.used]
     variance = scale**2 if problem.config.robust else float(raw @ raw) / len(raw)
-    if first or variance < MODEL_ERRS:
+    if variance < MODEL_ERRS:
         return huber, 1.0
     bounded = np.clip(raw / np.sqrt(variance), -3.0, 3.0)
     effects = [1.0]
@@ -171,12 +204,11 @@ def _loss(problem: Problem, u: np.ndarray, first: bool = False) -> tuple[float, 
     return huber, variance * max(effects)
 
 
-def _poor(problem: Problem, u: np.ndarray) -> bool:
+def _poor(end: _End) -> bool:
     """Whether the model is far from the data, in sigma and in per cent."""
-    found = problem.evaluate(u)
-    with np.errstate(invalid="ignore"):
-        relative = float(np.nanmedian(np.abs(found.predicted / problem.data.radiance - 1.0)))
-    return _scale(found) > POOR and relative > POOR_LOG
+    found, data = end.problem.evaluate(end.solution.u), end.problem.data
+    relative = float(np.median(np.abs(found.predicted[data.used] / data.radiance[data.used] - 1.0)))
+    return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
 
 
 def _starting_points(whole: Problem) -> list[np.ndarray]:
@@ -189,6 +221,16 @@ def _starting_points(whole: Problem) -> list[np.ndarray]:
         ]
         points.append(np.array(middle))
     return points
+
+
+def _few(whole: Problem) -> Problem:
+    """The problem for some directions, and as many wavelengths as are solved at once."""
+    rows, count = _some(whole.data, FEW), len(whole.data.wavelengths_nm)
+    if whole.data.mixing is not None or count <= MAX_CHANNELS:
+        return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
+    order = np.argsort(whole.data.wavelengths_nm)
+    channels = np.sort(order[np.linspace(0, count - 1, MAX_CHANNELS).round().astype(int)])
+    return whole.part(rows, channels, max(whole.config.tolerance, ROUGH))
 
 
 def _some(data: Observations, count: int) -> np.ndarray:
@@ -213,14 +255,15 @@ def _check_units(problem: Problem) -> None:
     """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
     if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
         return  # the calibration is free: any unit will do
-    ratios = []
+    ratio = np.inf
     for factor in (1.0, 0.1, 10.0):
         u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
-        predicted = problem.evaluate(np.array(u)).predicted
-        ratios.append(float(np.nanmedian(problem.data.radiance / np.maximum(predicted, 1e-30))))
-    ratio = min(ratios, key=lambda r: abs(np.log(max(r, 1e-30))))
-    if not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
-        raise InputError(
-            f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
-            "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
-        )
+        predicted = problem.evaluate(np.array(u)).predicted[problem.data.used]
+        found = float(np.median(problem.data.radiance[problem.data.used] / np.maximum(predicted, 1e-30)))
+        ratio = min(ratio, found, key=lambda r: abs(np.log(max(r, 1e-30))))
+        if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+            return
+    raise InputError(
+        f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
+        "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
+    )

@@ -30,7 +30,8 @@ from .observations import Observations
 STEP = 0.005
 SMALLEST = {"ground_albedo": 0.5, "g": 0.5, "single_scattering_albedo": 0.5}  # values below are stepped as these
 SUNS_DEG = 5.0  # suns are solved from and to multiples of this, so that small turns keep the nodes
-KEPT = 4  # skies, and radiances of the samples
+KEPT = 4  # skies
+ROUGH = 0.2  # tolerance of the skies that derivatives and first steps are taken from: 0.2 % off, in fact
 FOREIGN = 2.0  # factor of optical depth from which on an atmosphere's nodes are placed anew
 
 Values = Mapping[str, Any]
@@ -55,24 +56,29 @@ class SkyModel:
         self.atmosphere, self.tolerance = atmosphere, tolerance
         self.altitude_m, self.view_zenith = altitude_m, view_zenith
         self.spectral, self.others = spectral, others
-        self._resolution: Resolution | None = None
         self._layout: Atmosphere | None = None
+        self.layout_number = 0
+        self._resolution, self._rough = Resolution(), Resolution()
         self._solved: dict[Any, Sky] = {}
-        self._seen: dict[Any, np.ndarray] = {}
         self._views = (doubles(altitude_m), doubles(view_zenith))
 
-    def at(self, data: Observations) -> SkyModel:
-        """The model for other samples, with the same nodes."""
-        other = SkyModel(
-            self.atmosphere, data.altitude_m, data.view_zenith, self.tolerance, self.spectral, self.others
-        )
-        other._resolution, other._layout = self._resolution, self._layout
+    def at(
+        self, data: Observations, atmosphere: Atmosphere | None = None, tolerance: float | None = None
+    ) -> SkyModel:
+        """The model for other samples, other wavelengths, another tolerance; with the same nodes if neither is given.
+        """
+        air, tolerance = atmosphere or self.atmosphere, tolerance or self.tolerance
+        other = SkyModel(air, data.altitude_m, data.view_zenith, tolerance, self.spectral, self.others)
+        if air is self.atmosphere and tolerance == self.tolerance:
+            other._resolution, other._rough, other._layout = self._resolution, self._rough, self._layout
         return other
 
     def place(self, values: Values) -> None:
         """Choose resolution and nodes for these values; they stay, so that skies differ by their values only."""
         self._layout = self.atmosphere.replace(values)
         self._resolution = Resolution.suited(self._layout, self.tolerance)
+        self._rough = Resolution.suited(self._layout, max(self.tolerance, ROUGH))
+        self.layout_number += 1
         self._solved.clear()
 
     def strays(self, values: Values) -> bool:
@@ -82,34 +88,30 @@ class SkyModel:
         here, there = (_depths(air) for air in (self.atmosphere.replace(values), self._layout))
         return bool(np.any(np.abs(np.log2(np.maximum(here, 0.02) / np.maximum(there, 0.02))) > np.log2(FOREIGN)))
 
-    def radiance(self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        """Radiance [N, W] with the values under the dotted names of ``values`` replaced; angles in radians [N]."""
-        key = (_key(values), sun_zenith.tobytes(), azimuth.tobytes(), id(self._layout))
-        if key not in self._seen:
-            while len(self._seen) >= KEPT:
-                self._seen.pop(next(iter(self._seen)))
-            self._seen[key] = self._evaluate([values], values, sun_zenith, azimuth)
-        return self._seen[key]
+    def radiance(
+        self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, *, rough: bool = False
+    ) -> np.ndarray:
+        """Radiance [N, W] with the values under the dotted names of ``values`` replaced; angles in radians [N].
+        ``rough``: at the resolution of derivatives."""
+        return self._evaluate([values], values, sun_zenith, azimuth, rough)
 
-    def derivatives(
-        self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, radiance: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """d radiance[n, w] / d value[w] for every name of ``values``, [N, W]; ``radiance``: that of the values."""
-        count = radiance.shape[1]
+    def derivatives(self, values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray) -> dict[str, np.ndarray]:
+        """d radiance[n, w] / d value[w] for every name of ``values``, [N, W]."""
+        count = len(self.atmosphere.wavelengths_nm)
         spectral = [name for name in self.spectral if name in values]
-        found, stepped, steps = {}, [], []
-        for name in spectral:
-            step = self._step(name, values[name])
-            stepped.append({**values, name: np.asarray(values[name]) + step})
-            steps.append(step)
-        if stepped:
-            changed = self._evaluate(stepped, values, sun_zenith, azimuth)
-            for i, (name, step) in enumerate(zip(spectral, steps, strict=True)):
-                found[name] = (changed[:, i * count : (i + 1) * count] - radiance) / step
+        found = {}
+        if spectral:
+            steps = [self._step(name, values[name]) for name in spectral]
+            stepped = [
+                {**values, name: np.asarray(values[name]) + step} for name, step in zip(spectral, steps, strict=True)
+            ]
+            light = self._evaluate([values, *stepped], values, sun_zenith, azimuth, rough=True)
+            for i, (name, step) in enumerate(zip(spectral, steps, strict=True), 1):
+                found[name] = (light[:, i * count : (i + 1) * count] - light[:, :count]) / step
         for name in self.others:
             step = 4.0 * STEP * float(values[name])  # nodes move along, so both sides and farther
             ends = [
-                self.radiance({**values, name: float(values[name]) + sign * step}, sun_zenith, azimuth)
+                self.radiance({**values, name: float(values[name]) + sign * step}, sun_zenith, azimuth, rough=True)
                 for sign in (1.0, -1.0)
             ]
             found[name] = (ends[0] - ends[1]) / (2.0 * step)
@@ -150,36 +152,31 @@ class SkyModel:
         return Atmosphere(document)
 
     def _evaluate(
-        self, several: list[Values], values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray
+        self, several: list[Values], values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, rough: bool
     ) -> np.ndarray:
         """Radiance for several sets of values side by side: [N, sets x W]."""
         if self._layout is None:
             self.place(values)
-        sky = self._sky(self._spread(several), values, sun_zenith)
+        sky = self._sky(self._spread(several), values, sun_zenith, self._rough if rough else self._resolution)
         light = sky.rays(self._views[0], doubles(sun_zenith), self._views[1], doubles(azimuth))
         dr.eval(light.radiance)
         count, columns = len(self.view_zenith), len(several) * len(self.atmosphere.wavelengths_nm)
         return np.stack([np.broadcast_to(v.numpy(), count) for v in light.radiance[:columns]], axis=-1).astype(float)
 
-    def _sky(self, air: Atmosphere, values: Values, sun_zenith: np.ndarray) -> Sky:
+    def _sky(self, air: Atmosphere, values: Values, sun_zenith: np.ndarray, resolution: Resolution) -> Sky:
         """The solved sky, kept: suns and azimuths change without another solve."""
         suns = (
             np.radians(SUNS_DEG) * np.floor(np.degrees(sun_zenith.min()) / SUNS_DEG),
             np.radians(SUNS_DEG) * np.ceil(np.degrees(sun_zenith.max()) / SUNS_DEG),
         )
-        key = (hash(air), suns)
+        key = (hash(air), suns, resolution)
         if key not in self._solved:
             while len(self._solved) >= KEPT:
                 self._solved.pop(next(iter(self._solved)))
             layout = self._layout.replace({name: values[name] for name in self.others})
-            self._solved[key] = Sky(
-                air, tolerance=self.tolerance, resolution=self._resolution, suns=suns, layout=layout
-            )
+            tolerance = self.tolerance if resolution == self._resolution else ROUGH
+            self._solved[key] = Sky(air, tolerance=tolerance, resolution=resolution, suns=suns, layout=layout)
         return self._solved[key]
-
-
-def _key(values: Values) -> Any:
-    return tuple((name, np.asarray(value).tobytes()) for name, value in sorted(values.items()))
 
 
 def _depths(air: Atmosphere) -> np.ndarray:

@@ -85,6 +85,11 @@ class Observations:
         changed["sun_azimuth"] = None if self.sun_azimuth is None else self.sun_azimuth[rows]
         return replace(self, **changed)
 
+    def channels(self, which: np.ndarray) -> Observations:
+        """Some of the wavelengths."""
+        arrays = {name: getattr(self, name)[:, which] for name in ("radiance", "sigma", "mask")}
+        return replace(self, **arrays, wavelengths_nm=self.wavelengths_nm[which])
+
 
 def observations(arrays: Mapping[str, Any], where: str = "observations", *, mixing: Any = None) -> Observations:
     """Observations from the arrays of the table above; rows without a sample are dropped.

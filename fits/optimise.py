@@ -15,22 +15,25 @@ import numpy as np
 
 MAX_ITERATIONS = 60
 # Part of the standard errors below which a step changes nothing that matters.
-STEP_TOLERANCE = 0.02
+STEP_TOLERANCE = 0.1
+LEAST_GAIN = 0.1
 FAR = 1e6
-FORESEEN = 0.3  # part of a step's change that the Jacobian may have missed to be corrected and not computed
+FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
 
 @dataclass(frozen=True)
 class Solution:
     """Where a minimisation ended: ``u`` [P], half the sum of squares ``cost``, ``iterations``, whether it
-    ``converged`` and the ``reason`` it stopped for."""
+    ``converged``, the ``reason`` it stopped for, and the last ``jacobian`` [M, P], which is that of a point within a
+    step of it."""
 
     u: np.ndarray
     cost: float
     iterations: int
     converged: bool
     reason: str
+    jacobian: np.ndarray
 
 
 class Residuals:
@@ -81,6 +84,11 @@ class Residuals:
         self._last, self.exact = (u, np.nan_to_num(self._jacobian(u))), True
         return self._last[1]
 
+    @property
+    def last_jacobian(self) -> np.ndarray:
+        """The Jacobian that was asked for last."""
+        return self._last[1]
+
     def cost(self, u: Any) -> float:
         """Half the sum of squares at u."""
         r = self.residual(u)
@@ -105,9 +113,9 @@ def minimise(
     step_tolerance: float = STEP_TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise half the sum of squares from ``start``. ``step_tolerance``: a step shorter than this
-    part of the standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration
-    and cost."""
+    """Minimise half the sum of squares from ``start``. ``step_tolerance``: a step that gains less than this part of the
+    standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration and cost.
+    """
     run = {"levenberg_marquardt": _levenberg_marquardt, "lbfgsb": _lbfgsb}[method]
     jax, _ = _jaxopt()
     with jax.enable_x64(True):
@@ -135,6 +143,9 @@ def _levenberg_marquardt(
         jacobian = np.zeros((len(functions.residual(u)), len(start))) if rejected else functions.jacobian(u)
         return residual(u), jnp.asarray(jacobian) @ tangent
 
+    def done(u: Any, iterations: int, converged: bool, reason: str) -> Solution:
+        return Solution(np.array(u), best, iterations, converged, reason, functions.last_jacobian)
+
     solver = jaxopt.LevenbergMarquardt(
         residual, materialize_jac=True, solver="cholesky", jit=False, implicit_diff=False, damping_parameter=1e-4
     )
@@ -143,34 +154,28 @@ def _levenberg_marquardt(
     state = solver.init_state(u)
     failures = 0
     for iteration in range(1, max_iterations + 1):
-        hessian = np.asarray(state.jtj)
         u_next, state = solver.update(u, state)
-        step, now = np.asarray(state.delta), float(state.value)
+        step, now = np.asarray(state.delta), functions.cost(u_next)
         if not np.all(np.isfinite(step)):
-            reason = "the data do not depend on a parameter: no step exists"
-            return Solution(np.asarray(u), best, iteration, False, reason)
+            return done(u, iteration, False, "the data do not depend on a parameter: no step exists")
         progress(iteration, min(now, best))
-        # The step in standard errors, root mean square: what another iteration would change.
-        length = float(np.sqrt(max(step @ hessian @ step, 0.0) / len(step)))
         gain = best - now
         if gain > 0.0:
             best, u, failures = now, u_next, 0
-            if length < enough:
-                reason = f"the last step was {length:.1g} standard errors"
-                return Solution(np.asarray(u), best, iteration, True, reason)
-            if gain < COST_TOLERANCE * best and functions.exact:
-                return Solution(np.asarray(u), best, iteration, True, "the cost no longer changes")
+            if gain < 0.5 * len(start) * enough**2:
+                return done(u, iteration, True, f"steps no longer gain {enough:g} standard errors")
             continue
         failures += 1
-        if not functions.exact and length >= enough:
+        # What the step promised; the cost's own rounding may hide less than a small part of a standard error.
+        promised = -0.5 * float(step @ np.asarray(state.gradient))
+        small = promised < 0.5 * len(start) * max(enough, LEAST_GAIN) ** 2
+        if not functions.exact:
             functions.renewed(u)
             state = solver.init_state(u)
-        elif length < enough or failures > 6:
-            if length < 1.0:
-                return Solution(np.asarray(u), best, iteration, True, "no step lowers the cost")
-            reason = "no step lowers the cost although the gradient is not zero"
-            return Solution(np.asarray(u), best, iteration, False, reason)
-    return Solution(np.asarray(u), best, max_iterations, False, f"{max_iterations} iterations were not enough")
+        elif small or failures > 5:
+            reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
+            return done(u, iteration, small, reason)
+    return done(u, max_iterations, False, f"{max_iterations} iterations were not enough")
 
 
 def _lbfgsb(
@@ -197,7 +202,9 @@ def _lbfgsb(
         before, cost, u = cost, functions.cost(u_next), u_next
         progress(iteration, cost)
         if length < enough:
-            return Solution(np.asarray(u), cost, iteration, True, f"the last step was {length:.1g} standard errors")
+            reason = f"the last step was {length:.1g} standard errors"
+            return Solution(np.array(u), cost, iteration, True, reason, jacobian)
         if abs(before - cost) <= COST_TOLERANCE * before:
-            return Solution(np.asarray(u), cost, iteration, True, "the cost no longer changes")
-    return Solution(np.asarray(u), cost, max_iterations, False, f"{max_iterations} iterations were not enough")
+            return Solution(np.array(u), cost, iteration, True, "the cost no longer changes", jacobian)
+    reason = f"{max_iterations} iterations were not enough"
+    return Solution(np.array(u), cost, max_iterations, False, reason, functions.jacobian(u))

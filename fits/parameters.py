@@ -49,7 +49,8 @@ BOUNDS: dict[str, tuple[float, float] | None] = {
 class Scalar:
     """One unknown: ``start``; bounds ``low`` and ``high`` (infinite: none); a Gaussian prior of mean ``prior`` and
     standard deviation ``prior_sigma`` (infinite: none); ``scale`` measures unbounded ones. ``positive``: a factor,
-    fitted and judged by its logarithm, of which the prior holds too."""
+    fitted and judged by its logarithm, of which the prior holds too. ``wavelength_nm``: of one that belongs to a
+    wavelength."""
 
     name: str
     start: float
@@ -60,6 +61,12 @@ class Scalar:
     scale: float = 1.0
     positive: bool = False
     nuisance: bool = False
+    wavelength_nm: float | None = None
+
+    @property
+    def family(self) -> str:
+        """The name without the wavelength."""
+        return self.name.rpartition("[")[0] if self.wavelength_nm is not None else self.name
 
     @property
     def logarithmic(self) -> bool:
@@ -139,6 +146,12 @@ class Leaf:
     wavelengths_nm: np.ndarray
     shape: np.ndarray | None
 
+    def at(self, channels: np.ndarray) -> Leaf:
+        """The leaf at some of the wavelengths."""
+        scalars = tuple(self.scalars[c] for c in channels) if self.mode == "per_wavelength" else self.scalars
+        shape = None if self.shape is None else self.shape[channels]
+        return Leaf(self.name, self.mode, scalars, self.wavelengths_nm[channels], shape)
+
     def values(self, v: np.ndarray) -> Any:
         """The value [W], or a number, for the scalars' values ``v``."""
         if self.mode == "per_wavelength":
@@ -179,7 +192,7 @@ def leaf_of(atmosphere: Atmosphere, name: str, spec: dict[str, Any]) -> Leaf:
     own = np.full(count, float(np.mean(current))) if not spectral else np.asarray(current)
     if mode == "per_wavelength":
         scalars = tuple(
-            _scalar(f"{name}[{nm:g} nm]", last, {**spec, **_at(spec, w, count, name)}, float(own[w]), name)
+            _scalar(f"{name}[{nm:g} nm]", last, {**spec, **_at(spec, w, count, name)}, float(own[w]), name, float(nm))
             for w, nm in enumerate(atmosphere.wavelengths_nm)
         )
         return Leaf(name, mode, scalars, atmosphere.wavelengths_nm, None)
@@ -213,7 +226,9 @@ def _at(spec: dict[str, Any], w: int, count: int, name: str) -> dict[str, Any]:
     return found
 
 
-def _scalar(label: str, kind: str, spec: dict[str, Any], own: float, name: str) -> Scalar:
+def _scalar(
+    label: str, kind: str, spec: dict[str, Any], own: float, name: str, wavelength_nm: float | None = None
+) -> Scalar:
     """A scalar with the bounds of its kind where none are given."""
 
     def read(key: str, default: float) -> float:
@@ -238,4 +253,4 @@ def _scalar(label: str, kind: str, spec: dict[str, Any], own: float, name: str) 
     sigma = read("prior_sigma", 0.0) if "prior_sigma" in spec else np.inf
     if not sigma > 0.0:
         raise InputError(f"free.{name}: prior_sigma is {sigma:g}; must be > 0")
-    return Scalar(label, start, low, high, read("prior", start), sigma)
+    return Scalar(label, start, low, high, read("prior", start), sigma, wavelength_nm=wavelength_nm)

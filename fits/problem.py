@@ -14,10 +14,13 @@ section 5.4: how much more the means of parts of the sky, or of wavelengths, sca
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+
+from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
 from .forward import SkyModel
@@ -59,6 +62,7 @@ class Problem:
     ) -> None:
         self.config, self.data, self.model, self.leaves = config, data, model, leaves
         self.huber, self.excess = huber, excess
+        self._last: dict[Any, Any] = {}
         self._nuisances = _nuisances(config, data)
         self.scalars = (*(s for leaf in leaves for s in leaf.scalars), *(n.scalar for n in self._nuisances))
         self.logarithmic = config.residual == "log"
@@ -77,12 +81,39 @@ class Problem:
 
     def with_loss(self, huber: float, excess: float) -> Problem:
         """The same with another loss and weight of the samples."""
-        return Problem(self.config, self.data, self.model, self.leaves, huber, excess)
+        other = Problem(self.config, self.data, self.model, self.leaves, huber, excess)
+        other._last = self._last
+        return other
 
-    def part(self, rows: np.ndarray) -> Problem:
-        """The same for some of the samples."""
-        data = self.data.part(rows)
-        return Problem(self.config, data, self.model.at(data), self.leaves, self.huber, self.excess)
+    def part(
+        self, rows: np.ndarray, channels: np.ndarray | None = None, tolerance: float | None = None
+    ) -> Problem:
+        """The same for some of the samples, and some of the wavelengths, with another tolerance of the sky."""
+        data, air, leaves = self.data.part(rows), self.model.atmosphere, self.leaves
+        if channels is not None:
+            air = at_wavelengths(air, data.wavelengths_nm[channels])
+            data, leaves = data.channels(channels), tuple(leaf.at(channels) for leaf in leaves)
+        return Problem(self.config, data, self.model.at(data, air, tolerance), leaves, self.huber, self.excess)
+
+    def spread(self, part: Problem, u: np.ndarray) -> np.ndarray:
+        """u of all scalars from that of a part's; those of other wavelengths are interpolated."""
+        known = dict(zip((s.name for s in part.scalars), u, strict=True))
+        families: dict[str, list[tuple[float, float]]] = {}
+        for scalar in part.scalars:
+            if scalar.wavelength_nm is not None:
+                families.setdefault(scalar.family, []).append((scalar.wavelength_nm, known[scalar.name]))
+        found = []
+        for scalar in self.scalars:
+            if scalar.name not in known:
+                nm, values = zip(*sorted(families[scalar.family]), strict=True)
+                known[scalar.name] = float(np.interp(scalar.wavelength_nm, nm, values))
+            found.append(known[scalar.name])
+        return np.array(found)
+
+    def gathered(self, part: Problem, u: np.ndarray) -> np.ndarray:
+        """u of a part's scalars from that of all."""
+        known = dict(zip((s.name for s in self.scalars), u, strict=True))
+        return np.array([known[s.name] for s in part.scalars])
 
     @property
     def start(self) -> np.ndarray:
@@ -103,27 +134,51 @@ class Problem:
 
     def evaluate(self, u: np.ndarray, jacobian: bool = False) -> Evaluation:
         """Residuals at u, and their derivatives by u."""
-        v, values = self.values(u), self.atmosphere_values(u)
-        factor, sun_zenith, azimuth = self._geometry_of(v)
-        light = self.model.radiance(values, sun_zenith, azimuth)
-        predicted = factor * self._mixed(light)
-        raw = (self._compared(predicted) - self._measured) / self._sigma
+        predicted, raw = self._kept("raw", u, self._raw)
         loss, slope = (v / np.sqrt(self.excess) for v in _pseudo_huber(raw[self._used], self.huber))
         priors = [s.prior_residual(x) for s, x in zip(self.scalars, u, strict=True)]
         with_prior = [i for i, s in enumerate(self.scalars) if np.isfinite(s.prior_sigma)]
         residual = np.concatenate([loss, [priors[i][0] for i in with_prior]])
         if not jacobian:
             return Evaluation(predicted, raw, residual)
+        columns = self.raw_jacobian(u) * slope[:, None]
+        below = np.zeros((len(with_prior), len(self.scalars)))
+        below[np.arange(len(with_prior)), with_prior] = [priors[i][1] for i in with_prior]
+        return Evaluation(predicted, raw, residual, np.concatenate([columns, below]))
+
+    def raw_jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives by u of the residuals over sigma of the samples in use, without the loss."""
+        return self._kept("jacobian", u, self._raw_jacobian)
+
+    def _kept(self, what: str, u: np.ndarray, make: Callable[[np.ndarray], Any]) -> Any:
+        """What ``make`` returns at u on the nodes in use; the last few are kept for problems that share samples."""
+        key = what, u.tobytes(), self.model.layout_number
+        if key not in self._last:
+            while len(self._last) >= 6:
+                self._last.pop(next(iter(self._last)))
+            self._last[key] = make(u)
+        return self._last[key]
+
+    def _raw(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        v, values = self.values(u), self.atmosphere_values(u)
+        factor, sun_zenith, azimuth = self._geometry_of(v)
+        predicted = factor * self._mixed(self.model.radiance(values, sun_zenith, azimuth))
+        return predicted, (self._compared(predicted) - self._measured) / self._sigma
+
+    def _raw_jacobian(self, u: np.ndarray) -> np.ndarray:
+        v, values = self.values(u), self.atmosphere_values(u)
+        factor, sun_zenith, azimuth = self._geometry_of(v)
+        predicted, _ = self._kept("raw", u, self._raw)
         columns = np.zeros((np.count_nonzero(self._used), len(self.scalars)))
         scale = 1.0 / (np.maximum(predicted, LEAST) * self._sigma) if self.logarithmic else 1.0 / self._sigma
         slopes = np.array([s.slopes(x)[0] for s, x in zip(self.scalars, u, strict=True)])
-        by_leaf = self.model.derivatives(values, sun_zenith, azimuth, light)
+        by_leaf = self.model.derivatives(values, sun_zenith, azimuth)
         first = 0
         for leaf in self.leaves:
             v_leaf = v[first : first + len(leaf.scalars)]
             for k, spread in enumerate(leaf.slopes(v_leaf)):
                 change = factor * self._mixed(by_leaf[leaf.name] * spread)
-                columns[:, first + k] = (scale * change)[self._used] * slope * slopes[first + k]
+                columns[:, first + k] = (scale * change)[self._used]
             first += len(leaf.scalars)
         turned: dict[str, np.ndarray] = {}
         for i, nuisance in enumerate(self._nuisances, first):
@@ -133,10 +188,8 @@ class Problem:
                 if nuisance.kind not in turned:
                     turned[nuisance.kind] = self._turned(nuisance.kind, values, sun_zenith, azimuth)
                 change = factor * self._mixed(turned[nuisance.kind])
-            columns[:, i] = (np.where(nuisance.applies, scale * change, 0.0))[self._used] * slope * slopes[i]
-        below = np.zeros((len(with_prior), len(self.scalars)))
-        below[np.arange(len(with_prior)), with_prior] = [priors[i][1] for i in with_prior]
-        return Evaluation(predicted, raw, residual, np.concatenate([columns, below]))
+            columns[:, i] = np.where(nuisance.applies, scale * change, 0.0)[self._used]
+        return columns * slopes
 
     def clusters(self) -> list[np.ndarray]:
         """For every sample in use, numbers of its part of the sky (SKY_PARTS) and scan, and of its channel and scan."""
@@ -172,9 +225,9 @@ class Problem:
         ends = []
         for sign in (1.0, -1.0):
             if kind == "sun_zenith":
-                ends.append(self.model.radiance(values, np.abs(zenith + sign * TURN), azimuth))
+                ends.append(self.model.radiance(values, np.abs(zenith + sign * TURN), azimuth, rough=True))
             else:
-                ends.append(self.model.radiance(values, zenith, azimuth - sign * TURN))
+                ends.append(self.model.radiance(values, zenith, azimuth - sign * TURN, rough=True))
         return (ends[0] - ends[1]) / (2.0 * np.degrees(TURN))
 
     def _mixed(self, light: np.ndarray) -> np.ndarray:
@@ -200,10 +253,11 @@ def _nuisances(config: FitConfig, data: Observations) -> list[_Nuisance]:
             here = np.broadcast_to((data.scan == scan)[:, None], data.radiance.shape)
             label = kind if data.scans == 1 else f"{kind}[scan {scan}]"
             if kind == "spectral_calibration":
-                names = data.wavelengths_nm if data.mixing is None else np.arange(len(data.mixing))
+                names = data.wavelengths_nm if data.mixing is None else np.arange(float(len(data.mixing)))
                 for c, nm in enumerate(names):
                     alone = here & (np.arange(data.radiance.shape[1]) == c)
-                    found.append(_Nuisance(kind, _factor(f"{label}[{nm:g}]", spec), alone))
+                    name = f"{label}[{nm:g} nm]" if data.mixing is None else f"{label}[channel {nm:g}]"
+                    found.append(_Nuisance(kind, replace(_factor(name, spec), wavelength_nm=float(nm)), alone))
             elif kind == "calibration":
                 found.append(_Nuisance(kind, _factor(label, spec), here))
             else:

@@ -157,7 +157,7 @@ def _by_channel(fit: Fit) -> list[dict[str, Any]]:
     return [
         name | _row(predicted[use, c], data.radiance[use, c])
         for c, (name, use) in enumerate(zip(names, data.used.T, strict=True))
-        if use.any()
+        if np.any(data.radiance[use, c] > 0.0)
     ]
 
 
@@ -168,7 +168,7 @@ def _by_angle(fit: Fit) -> list[dict[str, Any]]:
     rows = []
     for low in range(0, 180, 15):
         here = data.used & ((angle >= low) & (angle < low + 15))[:, None]
-        if here.any():
+        if np.any(data.radiance[here] > 0.0):
             rows.append({"from_deg": low, "to_deg": low + 15} | _row(predicted[here], data.radiance[here]))
     return rows
 

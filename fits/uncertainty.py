@@ -21,6 +21,7 @@ from .parameters import Scalar
 from .problem import Evaluation, Problem
 
 NARROWED = 0.5  # averaging kernel below which the prior knows more than the data
+WIDE = 0.25  # part of the range between the bounds that an interval spans if little is known
 ALIKE = 0.9  # correlation, by the data alone, from which on two parameters cannot be told apart
 
 
@@ -54,7 +55,9 @@ def uncertainty(problem: Problem, u: np.ndarray, found: Evaluation) -> Uncertain
     kernel = np.diag(_inverse(weighed + told + bounds) @ weighed).clip(0.0, 1.0)
     errors, model_error = (np.sqrt(np.diag(m)) for m in (inverse, with_model_error))
     values = problem.values(u)
-    alone = _correlation(_inverse(weighed + 1e-12 * np.diag(np.diag(weighed))))
+    # What the data tell by themselves; factors of single wavelengths stay small by their priors.
+    kept = np.diag([np.sum(priors[:, i] ** 2) * (s.wavelength_nm is not None) for i, s in enumerate(scalars)])
+    alone = _correlation(_inverse(weighed + kept))
     sentences = _sentences(scalars, values, kernel, alone, model_error * np.abs(by_z))
     return Uncertainty(
         inverse * by_z * by_z[:, None],
@@ -95,10 +98,13 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 def _sentences(
     scalars: tuple[Scalar, ...], values: np.ndarray, kernel: np.ndarray, alone: np.ndarray, model_error: np.ndarray
 ) -> tuple[str, ...]:
-    """What the data cannot tell, in words."""
-    found = []
+    """What the data cannot tell, in words; values per wavelength in one sentence."""
+    found, unknown = [], {}
     for i, scalar in enumerate(scalars):
         if scalar.nuisance:
+            continue
+        if kernel[i] < NARROWED and scalar.wavelength_nm is not None:
+            unknown.setdefault(scalar.family, []).append(scalar.wavelength_nm)
             continue
         if kernel[i] < NARROWED:
             by = "its prior" if np.isfinite(scalar.prior_sigma) else "its bounds"
@@ -107,7 +113,7 @@ def _sentences(
             continue
         low, high = scalar.interval(values[i], model_error[i])
         ends = [np.log(v) if scalar.logarithmic else v for v in (low, high, scalar.low, scalar.high)]
-        if scalar.bounded and ends[1] - ends[0] > 0.5 * (ends[3] - ends[2]):
+        if scalar.bounded and ends[1] - ends[0] > WIDE * (ends[3] - ends[2]):
             found.append(
                 f"{scalar.name} is not identifiable: with the model's errors anything from {low:.3g} to {high:.3g} is "
                 "possible."
@@ -121,4 +127,7 @@ def _sentences(
                 f"{scalar.name} is not identifiable while {scalars[j].name} is free: the data change in the same way "
                 f"with both (correlation {alone[i, j]:.2f})."
             )
+    for family, wavelengths in unknown.items():
+        at = ", ".join(f"{nm:g}" for nm in wavelengths)
+        found.append(f"{family} is not identifiable at {at} nm: its prior or bounds say more than the data.")
     return tuple(found)

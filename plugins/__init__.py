@@ -21,6 +21,7 @@ PLUGINS = {
     "atmosphere": ("emitter", "Emitter", "emitter", "AtmosphereEmitter"),
     "atmosphere_needs": ("emitter", "Emitter", "needs", "AtmosphereNeeds"),
     "atmosphere_sun": ("emitter", "Emitter", "reference", "AtmosphereSun"),
+    "atmosphere_path": ("integrator", "SamplingIntegrator", "path", "AtmospherePath"),
     "atmosphere_volpath": ("integrator", "SamplingIntegrator", "volpath", "AtmosphereVolpath"),
     "atmosphere_medium": ("medium", "Medium", "medium", "AtmosphereMedium"),
     "cornette_shanks": ("phase", "PhaseFunction", "cornette_shanks", "CornetteShanksPhase"),

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.parameters import parameter_names
 from atmo_jit.sky import Sky
 
 from . import albedo, bounds, settings
@@ -48,14 +49,15 @@ Sun and sky of a planet's atmosphere (:monosp:`atmosphere`)
  * - altitude
    - |float|
    - Altitude of the observer above the ground in metres, the same for the whole scene. (Default: 1)
-   - |exposed|
+   - |exposed|, |differentiable|
 
  * - *any value of the atmosphere* (``mie.phase.g``, ``rayleigh.scattering_per_m``, ``ozone.center_m``, ...)
    - |float| or |string|
    - Replaces the value of that dotted name. Values per wavelength are one number for all, or numbers separated by
      commas or spaces, or a vector. Python dicts spell the dots as underscores (``mie_phase_g``), because Mitsuba's
-     dict loader reserves dots.
-   - |exposed|
+     dict loader reserves dots. Derivatives are those of the solved sky (see below).
+   - |exposed|, |differentiable| (not ``wavelengths_nm``,
+     ``sun_angular_radius_deg`` and tables of phase functions)
 
  * - sun_direction
    - |vector|
@@ -127,6 +129,11 @@ variants its luminance. In spectral variants radiance is interpolated between th
 spectrum, linearly in lambda^-4) and, outside of their range, stays in the ratio to the solar spectrum that it has at
 the nearest one; rendered to sRGB this gives the rgb variants' values. In polarised variants the light is unpolarised.
 
+**Derivatives.** Sky, ground and sun follow every number of the atmosphere, through all orders of scattering:
+``mi.traverse`` hands them out, and a loss of rendered pixels leads back to them (``mi.ad.Adam`` and the like; one
+solver pass in reverse serves all of them). Sampling densities and the places of the tables' nodes are not
+differentiated: they do not change what is rendered on average.
+
 **Sampling.** Sun and sky are sampled in proportion to their irradiance, the sky by the luminance of its table.
 Particle tracing (``ptracer``) needs the scene's size, which Mitsuba does not tell Python plugins: vectorised variants
 use the bounds of all shapes that are loaded; in scalar variants call ``emitter.set_scene(scene)`` first.
@@ -169,7 +176,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             numbers |= {name: getattr(found.moment, name) for name in Moment.names()}
         self._values = {name: array(value) for name, value in numbers.items()}
         self._sun_direction = mi.Vector3f(*found.direction)
-        self._atmosphere_values = {name: array(self._given(name)) for name in self._atmosphere.names()}
+        self._atmosphere_values = {name: array(self._atmosphere.given(name)) for name in self._atmosphere.names()}
         self._seen = {name: host(value) for name, value in self._atmosphere_values.items()}
         self._sky: Sky | None = None
         self._scene: Any = None
@@ -185,10 +192,11 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         if self._albedo is not None:
             callback.put("albedo", self._albedo, fixed)
         for name, value in self._values.items():
-            callback.put(name, value, free if name in SCALES else fixed)
+            callback.put(name, value, free if name in (*SCALES, "altitude") else fixed)
         callback.put("sun_direction", self._sun_direction, mi.ParamFlags.ReadOnly if self._moment else free)
+        continuous = self._continuous()
         for name, value in self._atmosphere_values.items():
-            callback.put(name, value, fixed)
+            callback.put(name, value, free if name in continuous else fixed)
         callback.put("sky_radiance", self._light.sky_table, free)
         callback.put("sun_radiance", self._light.sun_table, free)
 
@@ -202,13 +210,6 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             self._prepare()
         else:
             self._solve()
-
-    def _given(self, name: str) -> Any:
-        """A value as the description has it: one number stays one number."""
-        node: Any = self._atmosphere.to_dict()
-        for key in name.split("."):
-            node = node[int(key)] if isinstance(node, list) else node[key]
-        return node
 
     def _albedo_values(self) -> np.ndarray | None:
         return None if self._albedo is None else albedo.values(self._albedo, self._atmosphere.wavelengths_nm)
@@ -225,6 +226,15 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         if reflected is not None and not np.array_equal(reflected, self._albedo_seen):
             self._atmosphere, self._sky = settings.with_albedo(self._atmosphere, reflected), None
         self._albedo_seen = reflected
+
+    def _parameters(self) -> dict[str, Any]:
+        """The parameters that carry derivatives into the tables, by their names in atmo_jit."""
+        continuous, named = self._continuous(), self._atmosphere_values
+        return {name: value for name, value in named.items() if name in continuous and dr.grad_enabled(value)}
+
+    def _continuous(self) -> set[str]:
+        """Names of the differentiable values of the atmosphere; the sun's edge is no place for derivatives."""
+        return set(parameter_names(self._atmosphere)) - {"sun_angular_radius_deg"}
 
     def _local_sun(self) -> Any:
         """The sun's direction in the local frame."""
@@ -245,7 +255,9 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             dr.make_opaque(sun, self._sun_direction)
         if self._sky is None:
             self._sky = _solved(self._atmosphere)
-        light = Light(self._sky, first(self._values["altitude"]), sun, self._limb_darkening)
+        light = Light(
+            self._sky, self._values["altitude"], sun, self._limb_darkening, parameters=self._parameters()
+        )
         if self._light is not None:
             # The tensors that mi.traverse has handed out stay those that are in use.
             for name in ("sky_table", "sun_table"):
@@ -259,14 +271,55 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         self._light.prepare(first(self._values["sun_scale"]), first(self._values["sky_scale"]))
         self._variables = variables(self._light)
 
+    # ---- for the integrator atmosphere_path
+
+    @property
+    def sky(self) -> Sky:
+        """The solved sky."""
+        return self._sky
+
+    @property
+    def sky_light(self) -> Light:
+        """Sun and sky as tables."""
+        return self._light
+
+    @property
+    def altitude_m(self) -> float:
+        return first(self._values["altitude"])
+
+    @property
+    def up(self) -> np.ndarray:
+        """The zenith in world space, float64."""
+        up = host(self._to_world.matrix).reshape(4, 4)[:3, 2]
+        return up / np.linalg.norm(up)
+
+    @property
+    def sun(self) -> np.ndarray:
+        """Direction towards the sun in world space, float64."""
+        turn = host(self._to_world.matrix).reshape(4, 4)[:3, :3]
+        sun = turn @ host(self._light.sun)
+        return sun / np.linalg.norm(sun)
+
+    @property
+    def scales(self) -> tuple[Any, Any]:
+        """``sun_scale`` and ``sky_scale``."""
+        return single(self._values["sun_scale"]), single(self._values["sky_scale"])
+
+    def world(self, d: Any) -> Any:
+        """A direction of the local frame in world space."""
+        return dr.normalize(self._to_world @ d)
+
+    def local(self, d: Any) -> Any:
+        """A direction of world space in the local frame."""
+        return dr.normalize(self._to_world.inverse() @ d)
+
     # ---- light, in world space
 
     def _where(self, d: Any) -> Any:
-        return self._light.where(dr.normalize(self._to_world.inverse() @ d))
+        return self._light.where(self.local(d))
 
     def _radiance(self, where: Any, wavelengths: Any, active: Any) -> Any:
-        scales = single(self._values["sun_scale"]), single(self._values["sky_scale"])
-        return self._light.radiance(where, wavelengths, *scales, active)
+        return self._light.radiance(where, wavelengths, *self.scales, active)
 
     # ---- Mitsuba's interface
 
@@ -283,7 +336,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         local = self._light.sample(sample, active)
         where = self._light.where(local)
         ds = mi.DirectionSample3f()
-        ds.d = dr.normalize(self._to_world @ local)
+        ds.d = self.world(local)
         ds.n = -ds.d
         ds.dist = FAR
         ds.p = dr.fma(ds.d, FAR, it.p)
@@ -297,7 +350,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> tuple[Any, Any]:
         local = self._light.sample(sample3, active)
         where = self._light.where(local)
-        d = -dr.normalize(self._to_world @ local)
+        d = -self.world(local)
         wavelengths, weight = self._sample_wavelengths(sample1)
         centre, radius = bounds.sphere(self._scene)
         offset = mi.warp.square_to_uniform_disk_concentric(sample2)

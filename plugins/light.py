@@ -6,12 +6,11 @@ Directions here are unit vectors in the emitter's local frame, Z up.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from atmo_jit.errors import InputError
 from atmo_jit.sky import Sky
@@ -19,14 +18,15 @@ from atmo_jit.spectrum import SpectralBasis
 
 from . import settings
 from .channels import Channels
-from .exposed import host, number
+from .exposed import first, host, number
 from .lookup import SkyLookup, SunLookup, sun_share, texture
-from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, SUN_COLUMNS, SUN_ROWS, Panorama, solve_disc, solve_sky
+from .panorama import COLUMNS, ROWS_DOWN, ROWS_UP, SUN_COLUMNS, SUN_ROWS, Panorama, disc_radiance, solve_disc, solve_sky
 
 SKY_SHAPE = (ROWS_DOWN + ROWS_UP + 2, COLUMNS + 1)
 SUN_SHAPE = (SUN_ROWS, SUN_COLUMNS)
 # Step of the difference that stands for the table's derivative: the radiance of twilight changes by 1 % over it.
 SUN_STEP_RAD = 2e-3
+ALTITUDE_STEP_M = 10.0
 
 
 @dataclass
@@ -43,42 +43,55 @@ class Where:
 
 
 class Light:
-    """The light of an atmosphere for an observer at ``altitude_m`` and a sun in the local direction ``sun``.
+    """The light of an atmosphere for an observer at ``altitude`` (m) and a sun in the local direction ``sun``.
 
+    ``parameters``: those by which the tables are differentiable, arrays by name (atmo_jit.parameters.parameter_names).
     ``sky_table`` and ``sun_table`` are the tensors that look-ups read; whoever changes them calls :meth:`prepare`.
     """
 
-    def __init__(self, sky: Sky, altitude_m: float, sun: Any, limb_darkening: bool) -> None:
+    def __init__(
+        self,
+        sky: Sky,
+        altitude: Any,
+        sun: Any,
+        limb_darkening: bool,
+        parameters: dict[str, Any] | None = None,
+    ) -> None:
         self.basis = SpectralBasis.of(sky.atmosphere)
         self.channels = Channels(self.basis)
-        x, y, z = host(sun)
+        (x, y, z), altitude_m = host(sun), first(altitude)
         self.sun = sun
         self.heading = self._heading(math.hypot(x, y))
         air = sky.atmosphere
         self.view = Panorama.of(air.bottom_radius_m, air.thickness_m, altitude_m, math.atan2(math.hypot(x, y), z))
-        self.sky_table = self.channels.tensor(solve_sky(sky, self.view), SKY_SHAPE)
+        self.sky_table = self.channels.tensor(solve_sky(sky, self.view, parameters=parameters), SKY_SHAPE)
         if dr.grad_enabled(sun):
-            self.sky_table = self._follow_sun(sky)
+            angle = dr.atan2(dr.norm(mi.Vector2f(sun.x, sun.y)), sun.z)
+            zenith = self.view.sun_zenith
+            self._follow(sky, angle, *({"sun_zenith": zenith + s} for s in (-SUN_STEP_RAD, SUN_STEP_RAD)))
+        if dr.grad_enabled(altitude):
+            step = max(ALTITUDE_STEP_M, 0.01 * altitude_m)
+            self._follow(sky, altitude, {"altitude_m": max(altitude_m - step, 0.0)}, {"altitude_m": altitude_m + step})
 
         aperture = max(2.0 * air.sun_angular_radius_deg, settings.SMALLEST_SUN_DEG)
+        follows = dict(parameters or {}) | ({"altitude_m": altitude} if dr.grad_enabled(altitude) else {})
         self.disc = solve_disc(sky, self.view, math.radians(0.5 * aperture), limb_darkening)
-        radiance = self.disc.brightness * air.solar_irradiance / self.disc.solid_angle
-        values = list(np.moveaxis(radiance, -1, 0).reshape(radiance.shape[-1], -1))
-        self.sun_table = self.channels.tensor(values, SUN_SHAPE)
+        self.sun_table = self.channels.tensor(disc_radiance(sky, self.disc, self.view, follows), SUN_SHAPE)
 
-    def _follow_sun(self, sky: Sky) -> Any:
-        """The sky's table with its derivative by the sun's zenith angle, a central difference of the solver's results.
+    def _follow(self, sky: Sky, value: Any, before: dict[str, float], after: dict[str, float]) -> None:
+        """Give the sky's table its derivative by where the observer or the sun is, ``value``: a difference of the
+        solver's results in the same directions.
 
-        The derivative by its azimuth is in the look-up.
+        The derivative by the sun's azimuth is in the look-up.
         """
-        zenith, step = self.view.sun_zenith, SUN_STEP_RAD
+        (first_, last), table = (next(iter(end.values())) for end in (before, after)), self.sky_table
         low, high = (
-            self.channels.tensor(solve_sky(sky, self.view, zenith + d), SKY_SHAPE).array for d in (-step, step)
+            self.channels.tensor(solve_sky(sky, replace(self.view, **end), self.view), SKY_SHAPE).array
+            for end in (before, after)
         )
-        angle = dr.atan2(dr.norm(mi.Vector2f(self.sun.x, self.sun.y)), self.sun.z)
-        move = dr.replace_grad(mi.Float(0.0), angle)
-        values = dr.detach(self.sky_table.array) + move * (dr.detach(high - low) / (2.0 * step))
-        return mi.TensorXf(values, self.sky_table.shape)
+        move = dr.replace_grad(mi.Float(0.0), value)
+        values = table.array + move * (dr.detach(high - low) / (last - first_))
+        self.sky_table = mi.TensorXf(values, table.shape)
 
     def _heading(self, across: float) -> tuple[Any, Any]:
         """Horizontal unit vector towards the sun; any one where it stands at the zenith."""
@@ -127,15 +140,36 @@ class Light:
         sky = dr.select(self._sky.covers(at.elevation), self._sky.pdf(at.elevation, at.place, active), 0.0)
         return dr.select(active, dr.fma(self._share, sun, self._rest * sky), 0.0)
 
+    @property
+    def sun_density(self) -> Any:
+        """Density per solid angle (1/sr) of directions drawn from the sun's disc."""
+        return self._sun.density
+
+    def sun_pdf(self, d: Any) -> Any:
+        """That density in a direction: 0 beside the disc."""
+        return dr.select(self._sun.distance2(d, self.sun) <= 1.0, self._sun.density, 0.0)
+
+    def sample_sun(self, sample: Any) -> Any:
+        """A direction within the sun's disc."""
+        return self._sun.sample(sample, self.sun)
+
+    def sky_pdf(self, d: Any) -> Any:
+        """Density per solid angle (1/sr) of :meth:`sample_sky`."""
+        at = self.where(d)
+        return dr.select(self._sky.covers(at.elevation), self._sky.pdf(at.elevation, at.place, True), 0.0)
+
+    def sample_sky(self, sample: Any, active: Any) -> Any:
+        """A direction in proportion to the radiance of the sky without the sun."""
+        z, phi = self._sky.sample(sample, active)
+        across = dr.safe_sqrt(dr.fma(-z, z, 1.0))
+        sin, cos = dr.sincos(phi)
+        hx, hy = self.heading
+        return mi.Vector3f(across * (cos * hx - sin * hy), across * (cos * hy + sin * hx), z)
+
     def sample(self, sample: Any, active: Any) -> Any:
         """A direction: of the sun's disc with probability ``share``, else of the sky."""
         last = 1.0 - 2.0**-24
         pick = sample.x < self._share
         first = mi.Point2f(dr.minimum(sample.x * self._share_inverse, last), sample.y)
         second = mi.Point2f(dr.clip((sample.x - self._share) * self._rest_inverse, 0.0, last), sample.y)
-        z, phi = self._sky.sample(second, active)
-        across = dr.safe_sqrt(dr.fma(-z, z, 1.0))
-        sin, cos = dr.sincos(phi)
-        hx, hy = self.heading
-        sky = mi.Vector3f(across * (cos * hx - sin * hy), across * (cos * hy + sin * hx), z)
-        return dr.normalize(dr.select(pick, self._sun.sample(first, self.sun), sky))
+        return dr.normalize(dr.select(pick, self.sample_sun(first), self.sample_sky(second, active)))

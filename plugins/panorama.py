@@ -165,16 +165,16 @@ def _means(values: np.ndarray, count: int) -> np.ndarray:
     return (1.0 - part) * values[low] + part * values[low + 1]
 
 
-def solve_sky(sky: Any, view: Panorama, sun_zenith: Any = None) -> list[Any]:
+def solve_sky(sky: Any, view: Panorama, nodes: Panorama | None = None, parameters: Any = None) -> list[Any]:
     """Radiance at all nodes, ground included: a list of W Dr.Jit Floats of length rows x columns.
 
-    ``sun_zenith`` (rad): another sun for the same directions, also a Dr.Jit number that carries a derivative.
+    ``nodes``: the panorama whose nodes' directions are meant, if it is another.
+    ``parameters``: those of the sky, Dr.Jit arrays by name, whose derivatives the radiance carries.
     """
-    zenith, azimuth = view.directions()
-    sun = view.sun_zenith if sun_zenith is None else sun_zenith
-    radiance = list(sky.rays(*_together(view.altitude_m, sun, zenith, azimuth)).radiance)
+    zenith, azimuth = (nodes or view).directions()
+    radiance = list(sky.rays(*_together(view.altitude_m, view.sun_zenith, zenith, azimuth)).radiance)
     dr.eval(radiance)  # all wavelengths in one kernel
-    return radiance
+    return _following(radiance, "radiance", sky, _views(view, zenith, azimuth), parameters)
 
 
 @dataclass(frozen=True)
@@ -198,6 +198,48 @@ class Disc:
     def solid_angle(self) -> float:
         """Of the whole disc, also where it has set (sr)."""
         return 4.0 * math.pi * math.sin(0.5 * self.radius) ** 2
+
+
+def _views(view: Panorama, zenith: np.ndarray, azimuth: np.ndarray) -> dict[str, Any]:
+    angles = {"sun_zenith_deg": view.sun_zenith, "view_zenith_deg": zenith, "azimuth_deg": azimuth}
+    return {"altitude_m": view.altitude_m, **{name: np.degrees(value) for name, value in angles.items()}}
+
+
+def _following(values: list[Any], output: str, sky: Any, views: dict[str, Any], parameters: Any) -> list[Any]:
+    """The values, with the derivatives of an output of the sky by parameters."""
+    if not parameters:
+        return values
+    from atmo_jit.derivatives import differentiable
+
+    options = {"tolerance": sky.tolerance, "resolution": sky.resolution}
+    moved = differentiable(sky.atmosphere, views, parameters, **options)[output]
+    return [dr.replace_grad(value, other) for value, other in zip(values, moved, strict=True)]
+
+
+def disc_radiance(sky: Any, disc: Disc, view: Panorama, parameters: Any = None) -> list[Any]:
+    """Radiance of the disc where ``brightness`` is known: W arrays or, with ``parameters``, W Dr.Jit Floats that carry
+    derivatives by them, of length rows x columns."""
+    solar = sky.atmosphere.solar_irradiance
+    radiance = list(np.moveaxis(disc.brightness * solar / disc.solid_angle, -1, 0).reshape(len(solar), -1))
+    if not parameters or disc.high <= disc.low:
+        return radiance
+    from atmo_jit.backend import floats, types
+
+    t = types()
+    elevation = np.linspace(disc.low, disc.high, SUN_ROWS)
+    views = _views(view, view.horizon_zenith - elevation, np.zeros(SUN_ROWS))
+    row = dr.arange(t.UInt, SUN_ROWS * SUN_COLUMNS) // SUN_COLUMNS
+    values = []
+    even = [floats(disc.brightness[:, 0, w]) for w in range(len(solar))]
+    for w, moved in enumerate(_following(even, "transmittance", sky, views, parameters)):
+        size = dr.detach(moved)
+        change = dr.select(size > 0.0, moved / dr.select(size > 0.0, size, 1.0), 1.0)
+        if "solar_irradiance" in parameters:
+            given = parameters["solar_irradiance"]
+            of_sun = dr.gather(t.Float, given, min(w, len(given) - 1))
+            change = change * (of_sun / dr.maximum(dr.detach(of_sun), 1e-30))
+        values.append(floats(radiance[w]) * dr.gather(t.Float, change, row))
+    return values
 
 
 def solve_disc(sky: Any, view: Panorama, radius: float, limb_darkening: bool = False) -> Disc:

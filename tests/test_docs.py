@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 METHOD, GLOSSARY = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("method.md", "glossary.md"))
-SOURCES = [*ROOT.glob("atmo_jit/**/*.py"), *ROOT.glob("plugins/*.py")]
+SOURCES = [*ROOT.glob("atmo_jit/**/*.py"), *ROOT.glob("plugins/*.py"), *ROOT.glob("fits/*.py")]
 PAGES = [ROOT / "README.md", *ROOT.glob("docs/*.md")]
 
 
@@ -25,10 +25,11 @@ def defined(nodes, names):
 
 @pytest.mark.parametrize("name", sorted(set(re.findall(r"`([a-z_]+(?:\.[A-Za-z_]+)+)`", METHOD))))
 def test_functions_of_the_method_exist(name):
-    folder = "." if name.startswith("plugins.") else "atmo_jit"
+    folder = "." if name.startswith(("plugins.", "fits.")) else "atmo_jit"
     parts = name.split(".")
-    count = 2 if name.startswith(("plugins.", "bake.")) else 1
-    file = ROOT / folder / "/".join(parts[:count])
+    count = 1
+    while (file := ROOT / folder / "/".join(parts[:count])).is_dir():
+        count += 1
     tree = ast.parse(file.with_suffix(".py").read_text(encoding="utf-8"))
     assert defined(tree.body, parts[count:])
 

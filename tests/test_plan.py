@@ -14,9 +14,11 @@ from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.costs import Cost
 from atmo_jit.errors import AtmosphereError, InputError
 from atmo_jit.harmonics import pair_count
-from atmo_jit.plan import TABLE_NODES, Needs, compared, plan
+from atmo_jit.needs import TABLE_NODES, Needs
+from atmo_jit.plan import OFF, compared, error_found, plan
 from atmo_jit.resolution import Stage
 from atmo_jit.sky import Sky, sky
+from atmo_jit.views import check_views
 from bench.methods import columns_of
 from bench.worlds import WORLDS, views_of, world
 
@@ -251,6 +253,35 @@ def test_planned_results_are_those_of_everything_built(name):
     truth = everything(description, views, tolerance=0.03)
     # Nothing times anything is nothing; what may differ is the rounding (6e-8 each) of sums of some hundred terms.
     assert largest_difference(found, truth) < 2e-5
+
+
+@pytest.mark.parametrize(("altitude", "sun"), [(0.0, 50.0), (12_000.0, 85.0), (4e5, 30.0)])
+def test_suns_that_are_not_looked_at_are_not_solved(altitude, sun):
+    """... and what is left is the light of everything built: farther suns shine on no path of these views."""
+    zenith, azimuth = np.linspace(3.0, 177.0, 30), np.linspace(0.0, 180.0, 30)
+    views = {"altitude_m": altitude, "sun_zenith_deg": sun, "view_zenith_deg": zenith, "azimuth_deg": azimuth}
+    planned = made(views=views)
+    low, high = planned.solved_suns_deg
+    assert low <= sun <= high and " of " in item(planned, "sun angles").size
+    assert planned.predicted.solve_cpu_s < made(views={"sun_zenith_deg": [0.0, 95.0]}).predicted.solve_cpu_s
+    changed = EARTH.replace({"mie.scattering_per_m": 8e-6})
+    for air, found in ((EARTH, planned.solve()), (changed, planned.solve(changed))):
+        truth = Sky(air, None, 0.03, planned.resolution)
+        assert largest_difference(radiance(found, check_views(views)), radiance(truth, check_views(views))) < 2e-4
+
+
+def test_all_suns_are_solved_where_views_have_them():
+    views = {"view_zenith_deg": 40.0, "sun_zenith_deg": np.linspace(0.0, 105.0, 9)}
+    assert made(views=views).solved_suns_deg is None and " of " not in item(made(views=views), "sun angles").size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hillaire2020", "mars", "small planet"])
+def test_errors_are_as_predicted_for_atmospheres_that_were_not_measured(name):
+    air = Atmosphere.load(WORLDS.get(name, name))
+    views = check_views(views_of(air.to_dict(), 40))
+    planned = plan(air, Needs.of_views(air, views), tolerance=0.01)
+    assert 0.0 < error_found(planned, views) < OFF * planned.predicted.error_percent
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import atmo_jit
-from atmo_jit.backend import types
+from atmo_jit.backend import traversing, types
 from atmo_jit.column import sun_columns
 from atmo_jit.grid import Grid
 from atmo_jit.multiple_scattering import solve
@@ -49,7 +49,7 @@ def test_a_recording_gives_what_was_recorded(orders):
 
 
 def test_derivatives_pass_through_a_solve_on_a_recorded_grid():
-    """d/d log(scattering of the gas, green) of the light at the ground, forward, against central differences."""
+    """d/d log(gas, green) of the light at the ground, forward and reverse, against central differences."""
     for _ in range(3):
         solved(EARTH, orders=2)
 
@@ -68,6 +68,11 @@ def test_derivatives_pass_through_a_solve_on_a_recorded_grid():
     dr.enable_grad(factor)
     irradiance = light(solved(EARTH, scaled(factor), orders=2))
     dr.forward(factor)
+    dr.enable_grad(factor)
+    again = light(solved(EARTH, scaled(factor), orders=2))
+    with traversing():
+        dr.backward(again)
+    assert dr.grad(factor).numpy()[0] == pytest.approx(dr.grad(irradiance).numpy()[0], rel=1e-5)
     step = 0.02
     ends = [light(solved(EARTH, scaled(1.0 + sign * step), orders=2)).numpy()[0] for sign in (1, -1)]
     assert dr.grad(irradiance).numpy()[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)

@@ -311,3 +311,24 @@ def test_a_range_of_suns_gives_what_all_suns_give(sun_deg):
         for suns in (None, (sun, sun))
     )
     assert part == pytest.approx(whole, rel=2e-4)
+
+
+def test_rays_come_in_the_order_in_which_they_were_asked():
+    """NumPy arrays are reordered for speed and put back; Dr.Jit's are not."""
+    solved, rng = Sky(SPEC, tolerance=0.1), np.random.default_rng(5)
+    columns = [4e5 * rng.random(60) ** 4, *(top * rng.random(60) for top in (1.8, np.pi, np.pi))]
+    found, exact = solved.rays(*columns), solved.rays(*map(doubles, columns))
+    for a, b in zip(found.radiance + found.transmittance, exact.radiance + exact.transmittance, strict=True):
+        assert np.allclose(a.numpy(), b.numpy(), rtol=1e-5)
+
+
+def test_later_orders_at_the_terminator_seen_from_space(monkeypatch):
+    """Long pieces of limb rays see many suns: uncut they are 27 % off; cut eight times finer they change by 8 %."""
+    solved = Sky("earth", tolerance=0.03)
+    tangent = np.linspace(2e3, 3.4e4, 33)
+    view = np.pi - np.arcsin((6.36e6 + tangent) / 6.76e6)
+    columns = [np.full(33, 4e5), np.full(33, np.radians(84.0)), view, np.full(33, 3.1)]
+    found = solved.rays(*columns).radiance
+    monkeypatch.setattr("atmo_jit.march.MAX_TURN", 0.004)
+    exact = solved.rays(*columns).radiance
+    assert max(np.abs(a.numpy() / b.numpy() - 1.0).max() for a, b in zip(found, exact, strict=True)) < 0.12

@@ -6,8 +6,8 @@ differences of neighbours. So each value takes two words, each a float whose las
     word 1    v: sign, exponent, 11 bits of mantissa      v_xy: sign, exponent, 3 bits
     word 2    v_x: sign, exponent, 7 bits                 v_y: sign, exponent, 7 bits
 
-A word is read as it is, without masking: what its last bits add is allowed for when its first are rounded. So v keeps
-2^-12, v_x and v_y keep 2^-9 and v_xy 2^-5 of themselves.
+A word is read as it is, without masking: what its last bits add is allowed for when its first are rounded. So v is
+right to 2^-12, v_x and v_y are to 2^-8 and v_xy is to 2^-4 of themselves.
 """
 
 from __future__ import annotations

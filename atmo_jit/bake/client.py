@@ -26,8 +26,10 @@ from .sunlight import Sunlight
 TRANSMITTANCE = (64, 256)  # altitudes, view cosines
 IRRADIANCE = (16, 64)  # altitudes, sun cosines
 SCATTERING = (32, 128, 8, 32)  # altitudes, view cosines, scattering angles, sun cosines
+Block = tuple[slice, slice]  # of altitudes and of suns
+WHOLE: Block = (slice(None), slice(None))
 # Quadrature nodes per piece of a ray, for suns above and below a cosine: what keeps 99 % of all texels within 0.3 %.
-TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 16
+TWILIGHT, DAY_NODES, TWILIGHT_NODES = 0.05, 3, 12
 
 
 @dataclass
@@ -69,8 +71,11 @@ def bruneton_tables(
     mu_s_min: float = -0.5,
     size: tuple[int, int, int, int] = SCATTERING,
     mie_weight: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    block: Block = WHOLE,
 ) -> BrunetonTables:
     """The tables of a solved sky, for suns down to the cosine ``mu_s_min``.
+
+    ``block``: of the scattering tables only these altitudes and suns; their texels are those of the whole.
 
     ``mie_weight(species, nu)`` [..., W]: a factor to single scattering by an aerosol species, for clients that multiply
     the sum by a phase function that is not its own.
@@ -78,70 +83,95 @@ def bruneton_tables(
     air = sky.atmosphere
     to = Bruneton(air.bottom_radius_m, air.top_radius_m, mu_s_min)
     h, mu = to.transmittance_inverse(*np.meshgrid(*map(texels, TRANSMITTANCE), indexing="ij"))
-    through = [v for band in sky.bands for v in transmittance_up(band.optics, h.ravel(), mu.ravel())]
+    through = []
+    for band in sky.bands:
+
+        def columns(optics: Any = band.optics) -> list[Any]:
+            return columns_up(optics, h.ravel(), mu.ravel())
+
+        # The same for all atmospheres with these profiles.
+        kept = band.field.grid.kept("columns of the transmittance texels", columns)
+        through += transmittance_up(band.optics, h.ravel(), mu.ravel(), kept)
     transmittance = np.stack(through, axis=-1).reshape(*TRANSMITTANCE, -1)
     h, mu_s = to.irradiance_inverse(*np.meshgrid(*map(texels, IRRADIANCE), indexing="ij"))
     _, diffuse = sky.irradiance(h.ravel(), np.arccos(mu_s).ravel())
     irradiance = np.stack([e.numpy() for e in diffuse], axis=-1).reshape(*IRRADIANCE, -1)
-    parts = [_scattering(band, to, size, mie_weight) for band in sky.bands]
+    parts = [_scattering(band, to, size, mie_weight, block) for band in sky.bands]
     return BrunetonTables(
         to, transmittance, irradiance, *(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True))
     )
 
 
-def transmittance_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[np.ndarray]:
-    """Transmittance to the top per channel, by quadrature, of rays that miss the ground: those that fall pass their
+def columns_up(optics: Any, h: np.ndarray, mu: np.ndarray) -> list[Any]:
+    """Columns (m) to the top per constituent, by quadrature, of rays that miss the ground: those that fall pass their
     perigee and rise again."""
-    if not optics.constituents:
-        return [np.ones(len(h), dtype=np.float32)] * optics.channel_count
     lowest = np.maximum(
         h - (optics.atmosphere.bottom_radius_m + h) * mu * mu / (1.0 + np.sqrt((1 - mu) * (1 + mu))), 0.0
     )
     columns = column_up(optics, floats(h), floats(np.abs(mu)))
     whole = column_up(optics, floats(lowest), dr.zeros(types().Float, len(h)))
     falls = floats(mu) < 0.0
-    depths = optics.optical_depths([dr.select(falls, 2.0 * w - c, c) for w, c in zip(whole, columns, strict=True)])
-    through = [dr.exp(-d) for d in depths]
+    found = [dr.select(falls, 2.0 * w - c, c) for w, c in zip(whole, columns, strict=True)]
+    dr.eval(found)
+    return found
+
+
+def transmittance_up(
+    optics: Any, h: np.ndarray, mu: np.ndarray, columns: list[Any] | None = None
+) -> list[np.ndarray]:
+    """Transmittance to the top per channel, of the rays of :func:`columns_up`, or with ``columns`` from there."""
+    if not optics.constituents:
+        return [np.ones(len(h), dtype=np.float32)] * optics.channel_count
+    through = [dr.exp(-d) for d in optics.optical_depths(columns or columns_up(optics, h, mu))]
     dr.eval(through)
     return [v.numpy() for v in through]
 
 
-def scattering_nodes(to: Bruneton, size: tuple[int, int, int, int]) -> tuple[np.ndarray, ...]:
+def scattering_nodes(
+    to: Bruneton, size: tuple[int, int, int, int], block: Block = WHOLE
+) -> tuple[np.ndarray, ...]:
     """h, mu, mu_s, nu of the scattering table's texels, [altitude, row, angle, sun] or broadcasting to it."""
     altitudes, rows, angles, suns = size
-    h, mu, _ = _views(to, altitudes, rows)
-    mu_s = to.sun_inverse(texels(suns))
+    h, mu, _ = view_rows(to, altitudes, rows, block[0])
+    mu_s = to.sun_inverse(texels(suns))[block[1]]
     nu = to.angle_inverse(texels(angles)[:, None], mu[..., None, None], mu_s)
     return h[:, None, None, None], mu[..., None, None], mu_s, nu
 
 
-def _views(to: Bruneton, altitudes: int, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """h [altitude], mu [altitude, row] and whether the row's rays meet the ground [row]."""
-    h, _ = to.transmittance_inverse(texels(altitudes), np.zeros(altitudes))
+def view_rows(
+    to: Bruneton, altitudes: int, rows: int, some: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """h [altitude], mu [altitude, row] and whether the row's rays meet the ground [row], of ``some`` of the altitudes
+    of a scattering table."""
+    h, _ = to.transmittance_inverse(texels(altitudes)[some], np.zeros(len(range(altitudes)[some])))
     x = texels(rows // 2)
     ground = np.arange(rows) < rows // 2
     place = np.concatenate([x[::-1], x])
-    return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (altitudes, rows))), ground
+    return h, to.view_inverse(h[:, None], place, np.broadcast_to(ground, (len(h), rows))), ground
 
 
 def _scattering(
-    band: Any, to: Bruneton, size: tuple[int, int, int, int], mie_weight: Callable[[int, np.ndarray], np.ndarray] | None
+    band: Any,
+    to: Bruneton,
+    size: tuple[int, int, int, int],
+    mie_weight: Callable[[int, np.ndarray], np.ndarray] | None,
+    block: Block,
 ) -> list[np.ndarray]:
     """Rayleigh, Mie and higher orders of one band, [altitude, row, angle, sun, C]."""
     altitudes, rows, angles, suns = size
-    views = _views(to, altitudes, rows)
+    views = view_rows(to, altitudes, rows, block[0])
 
     def angle(index: Any, view: Any, cosine: Any) -> Any:
         return to.angle_inverse(types().Float(index) / (angles - 1.0), view, cosine)
 
     weight = None
     if mie_weight is not None:
-        nu = scattering_nodes(to, size)[3]
+        nu = scattering_nodes(to, size, block)[3]
 
         def weight(species: int) -> np.ndarray:
             return mie_weight(species, nu)[..., band.optics.indices].astype(np.float32)
 
-    return scattered_light(band, views, to.sun_inverse(texels(suns)), angle, angles, weight)
+    return scattered_light(band, views, to.sun_inverse(texels(suns))[block[1]], angle, angles, weight)
 
 
 def scattered_light(
@@ -162,6 +192,8 @@ def scattered_light(
     ground = np.broadcast_to(ground, mu.shape)
     size = (*mu.shape, angles, len(mu_s))
     sunlight = Sunlight(optics, band.columns)
+    # Kernels run while NumPy prepares the next: nothing is fetched before all are under way.
+    mean = MeanSource(band, mu_s) if band.source is not None else None
     # The planet's shadow lies across the rays of low suns, and takes a finer quadrature.
     low = int(np.count_nonzero(mu_s < TWILIGHT))
     parts, lines = [], None
@@ -170,27 +202,29 @@ def scattered_light(
             continue
         lines = Sightlines(optics, np.repeat(h, mu.shape[1]), mu.ravel(), ground=ground.ravel(), nodes=nodes)
         lanes = _Lanes(mu, mu_s[some], angle, angles)
-        single = lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu)
-        parts.append([_stacked(light, (*size[:3], len(mu_s[some]))) for light in single])
+        parts.append(lines.single(sunlight, lanes.ray, lanes.cosine, lanes.across, lanes.nu))
+    higher = None
+    if mean is not None:
+        whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
+        edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
+        x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
+        series = Series(mean.along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
+        lanes = _Lanes(mu, mu_s, angle, angles)
+        higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
+        dr.eval(higher)
     rayleigh = mie = np.zeros((*size, optics.channel_count), dtype=np.float32)
     species = [c.name for c in optics.atmosphere.mie]
     for k, *light in zip(optics.scatterers, *parts, strict=True):
-        name, whole = optics.constituents[k].name, np.concatenate(light, axis=3)
+        name = optics.constituents[k].name
+        one = np.concatenate([_stacked(v, (*size[:3], -1, optics.channel_count)) for v in light], axis=3)
         if name == "rayleigh":
-            rayleigh = whole
+            rayleigh = one
         else:
-            mie = mie + (whole if mie_weight is None else whole * mie_weight(species.index(name)))
-    if band.source is None:
+            mie = mie + (one if mie_weight is None else one * mie_weight(species.index(name)))
+    if higher is None:
         return [rayleigh, mie, np.zeros_like(rayleigh)]
-    whole = lines.scattering.reshape(*mu.shape, *lines.scattering.shape[1:])
-    edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
-    x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
-    series = Series(MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
-    lanes = _Lanes(mu, mu_s, angle, angles)
-    higher = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)
-    dr.eval(higher)
     # Polynomials swing about 0 where no light is left.
-    return [rayleigh, mie, np.maximum(_stacked(higher, size), 0.0)]
+    return [rayleigh, mie, np.maximum(_stacked(higher, (*size, -1)), 0.0)]
 
 
 class _Lanes:
@@ -213,4 +247,4 @@ class _Lanes:
 
 def _stacked(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
     """Channels as the last axis."""
-    return np.stack([v.numpy() for v in values], axis=-1).reshape(*shape, -1)
+    return np.stack([v.numpy() for v in values], axis=-1).reshape(shape)

@@ -28,7 +28,7 @@ class MeanSource:
     """Means for the suns ``mu_s`` [S], at Chebyshev nodes from the ground to the top or at the one altitude ``h`` [1]
     (m), which may lie above it.
 
-    ``harmonics`` [altitude, up + down, sun, azimuthal order, scatterer, channel]. How many nodes follows from the
+    ``harmonics`` [altitude, channel, scatterer, up + down, sun, azimuthal order]. How many nodes follows from the
     degree of the field: what is scattered toward the observer has the harmonics of the light that it comes from.
     """
 
@@ -62,7 +62,7 @@ class MeanSource:
         mean = np.divide(values, whole, out=np.zeros_like(values), where=whole > 0.0)
         m = np.arange(azimuths)
         series = np.cos(m[:, None] * half_circle(azimuths)) * np.where(m == 0, 1.0, 2.0)[:, None] / azimuths
-        self.harmonics = np.einsum("mj,avsjkc->avsmkc", series.astype(np.float32), mean, optimize=True)
+        self.harmonics = np.einsum("mj,avsjkc->ackvsm", series.astype(np.float32), mean, optimize=True)
 
     def along(self, h: np.ndarray, x: np.ndarray, up: np.ndarray, scattering: np.ndarray) -> np.ndarray:
         """Cosine series in azimuth of the radiance along rays, float32 [A, V, S, azimuthal order, C].
@@ -70,22 +70,19 @@ class MeanSource:
         ``h`` [A] (m); ``x`` [A, V]: place between the horizon (0) and zenith or nadir (1) as in :func:`view_cosines`,
         ``up`` [V] or [A, V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
         """
-        values = np.moveaxis(self.harmonics, 4, 0)  # scatterers apart
-        kinds, a, v, *rest = values.shape
-        values = values.reshape(kinds, a, v, -1)
+        altitudes, channels, kinds, v, suns, orders = self.harmonics.shape
+        values = self.harmonics.reshape(altitudes, -1)
         if not self.single:
             place = chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0)))
-            values = np.stack([np.tensordot(place.astype(np.float32), kind, 1) for kind in values])
+            values = place.astype(np.float32) @ values
         matrix = np.zeros((*x.shape, v), dtype=np.float32)
         up = np.broadcast_to(up, x.shape)
         for half, nodes in ((up, slice(0, self.up)), (~up, slice(self.up, v))):
             matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
-        total = np.zeros((*x.shape, *rest), dtype=np.float32)
-        for k, kind in enumerate(values):
-            mean = (matrix @ kind).reshape(*x.shape, *rest)
-            mean *= scattering[:, :, None, None, k].astype(np.float32)
-            total += mean
-        return total
+        # All at once, scatterers added up: one product of matrices per altitude and channel.
+        weights = np.einsum("avkc,avn->acvkn", scattering.astype(np.float32), matrix)
+        sums = weights.reshape(len(h), channels, -1, kinds * v) @ values.reshape(len(h), channels, kinds * v, -1)
+        return np.moveaxis(sums.reshape(len(h), channels, -1, suns, orders), 1, -1)
 
 
 def view_cosines(radius: float, thickness: float, h: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:

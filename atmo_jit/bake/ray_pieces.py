@@ -13,9 +13,9 @@ import numpy as np
 
 from ..backend import floats, types, uints
 from ..grid import profile_key
+from ..march import MAX_TURN
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
-from .sunlight import SIZE as SUNLIGHT
 
 MAX_DEPTH = 1.0  # optical depth of a piece
 LONGEST = 32  # pieces into which one shell is cut at most
@@ -97,9 +97,11 @@ class Rays:
         self._pieces: dict[bytes, Pieces] = {}
 
     def pieces(self, extinction: np.ndarray) -> Pieces:
-        """The rays cut so that the optical depth of a piece is at most MAX_DEPTH; ``extinction`` [constituent, C]."""
+        """The rays cut so that the optical depth of a piece is at most MAX_DEPTH and its turn about the planet's centre
+        MAX_TURN; ``extinction`` [constituent, C]."""
         depth = (extinction.T @ self._columns).max(axis=0, initial=0.0)
-        parts = np.clip(np.ceil(depth / MAX_DEPTH), 1, LONGEST).astype(int)
+        turn = (self._shells[2] - self._shells[1]) / self._air.bottom_radius_m
+        parts = np.clip(np.ceil(np.maximum(depth / MAX_DEPTH, turn / MAX_TURN)), 1, LONGEST).astype(int)
         key = parts.tobytes()
         if key not in self._pieces:
             self._pieces = {key: Pieces(self, *self._shells, parts)}
@@ -112,8 +114,9 @@ class Rays:
         return np.array(found).reshape(len(self._profiles), *h.shape)
 
     def table(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
-        """Per point: row of sunlight, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn about the planet's
-        centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in cosines."""
+        """Per point: square root of the unit altitude, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn
+        about the planet's centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in
+        cosines."""
         air = self._air
         h, r = self._altitude(ray, distance)
         horizon = -np.sqrt(h * (2.0 * air.bottom_radius_m + h)) / r
@@ -121,7 +124,7 @@ class Rays:
         return floats(
             np.column_stack(
                 [
-                    np.sqrt(np.clip(h / air.thickness_m, 0.0, 1.0)) * (SUNLIGHT[0] - 1),
+                    np.sqrt(np.clip(h / air.thickness_m, 0.0, 1.0)),
                     horizon,
                     1.0 / (1.0 - horizon),
                     (self.r[ray] + distance * self.mu[ray]) / r,
@@ -186,6 +189,9 @@ class Nodes:
 
 
 def sums(values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next."""
-    running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    return running[first[1:]] - running[first[:-1]]
+    """Sums [R, ...] of ``values`` [P, ...] from each of ``first`` [R + 1] up to the next, none from differences."""
+    total = np.zeros((len(first) - 1, *values.shape[1:]))
+    some = np.flatnonzero(np.diff(first))
+    if len(some):
+        total[some] = np.add.reduceat(values, first[some])
+    return total

@@ -13,6 +13,7 @@ over the stretch that a node stands for. ``python -m bench.tables`` prints what 
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -22,8 +23,7 @@ from ..backend import floats, packet, padded, types, uints
 from ..march import relative_azimuth
 from ..optics import Optics
 from ..single_scattering import horizontal_irradiance
-from .ray_pieces import Nodes, Rays, sums
-from .sunlight import SIZE as SUNLIGHT
+from .ray_pieces import Rays, sums
 from .sunlight import Sunlight
 
 NODES = 3  # Gauss-Legendre nodes per piece
@@ -64,17 +64,17 @@ class Sightlines:
         through = np.exp(-np.einsum("kc,kgp->gpc", extinction, at.columns)) * at.length[..., None]
         weight = np.einsum("kc,kgp,gpc->pgkc", scattering, at.densities[optics.scatterers], through)
         self.scattering = sums(weight.sum(axis=1), at.first)
-        self._gather_stretches(at, weight, stretches)
+        self._pieces, self._parts = (at, weight), stretches
         self._nodes, self._first_node, self._ends = at.table, at.first_node, rays.ends
         self._weights = _padded_channels(weight.reshape(weight.shape[0] * nodes, *weight.shape[2:]))
         through = np.where(self.ground[:, None], self.transmittance, 0.0)
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
 
-    def _gather_stretches(self, at: Nodes, weight: np.ndarray, parts: int) -> None:
-        """Neighbouring pieces as stretches with about equal shares of what the ray scatters, and the centroid of each.
-
-        ``weight`` [piece, node, scatterer, channel]; ``parts``: stretches of a ray, 0: every piece is one.
-        """
+    @cached_property
+    def _stretches(self) -> tuple[Any, Any, Any]:
+        """Neighbouring pieces as stretches with about equal shares of what the ray scatters: table of their centroids,
+        weights, and the first of each ray."""
+        (at, weight), parts = self._pieces, self._parts
         rays, ray, distance = at.rays, at.ray, at.distance.T
         channels = np.maximum(self.scattering.sum(axis=1), 1e-300)
         share = (weight.sum(axis=2) / channels[ray][:, None]).mean(axis=2)
@@ -89,9 +89,11 @@ class Sightlines:
         ray = ray[first]
         lit = total > 0.0
         centre = np.where(lit, moment / np.where(lit, total, 1.0), distance[first, 0])
-        self._stretches = rays.table(ray, centre, np.zeros(len(first)))
-        self._stretch_weights = _padded_channels(np.add.reduceat(weight.sum(axis=1), first))
-        self._first_stretch = uints(np.searchsorted(ray, np.arange(len(self.stop) + 1)))
+        return (
+            rays.table(ray, centre, np.zeros(len(first))),
+            _padded_channels(np.add.reduceat(weight.sum(axis=1), first)),
+            uints(np.searchsorted(ray, np.arange(len(self.stop) + 1))),
+        )
 
     def nu(self, ray: Any, mu_s: Any, across: Any) -> Any:
         """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``, evaluated.
@@ -137,20 +139,21 @@ class Sightlines:
         t = types()
         kinds, channels = len(self.optics.scatterers), self.optics.channel_count
         size = padded(channels)
-        per_row = self.optics.thickness / (SUNLIGHT[0] - 1.0) ** 2
+        thickness = self.optics.thickness
+        table, weights, first = self._stretches
 
         def stretch(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, _, _, cos_turn, sin_turn, mu, _, _ = packet(self._stretches, i, 8)
+            root, _, _, cos_turn, sin_turn, mu, _, _ = packet(table, i, 8)
             there = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * across), -1.0, 1.0)
-            toward = source.scattered(row * row * per_row, there, mu, relative_azimuth(mu, there, nu), True)
-            weight = packet(self._stretch_weights, i, kinds * size)
+            toward = source.scattered(root * root * thickness, there, mu, relative_azimuth(mu, there, nu), True)
+            weight = packet(weights, i, kinds * size)
             for n in range(kinds):
                 for c in range(channels):
                     sums[n * channels + c] = dr.fma(weight[n * size + c], toward[n][c], sums[n * channels + c])
             return i + 1, sums
 
         sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
-        start, end = (dr.gather(t.UInt, self._first_stretch, ray + o) for o in (0, 1))
+        start, end = (dr.gather(t.UInt, first, ray + o) for o in (0, 1))
         _, sums = dr.while_loop((start, sums), lambda i, _: i < end, stretch, label="sightlines: multiple")
         dr.eval(sums)
         return [sums[n * channels : (n + 1) * channels] for n in range(kinds)]

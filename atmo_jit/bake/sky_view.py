@@ -31,6 +31,7 @@ SIZE = (96, 80, 64)  # rows above the horizon, rows below, columns
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 CROWDED = (0.1, 0.9)  # unit latitude below which rows crowd: of an observer some centimetres above the ground, far up
+SUNLIGHT = (96, 320)  # size of the table of sunlight: altitudes, sun cosines
 OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
 
 
@@ -238,7 +239,7 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
         more = series.at(ray, floats(np.broadcast_to(nodes.cos_phi, shape)))
         smooth = [v + m for v, m in zip(smooth, more, strict=True)]
     peaks = {}
-    singles = lines.single(Sunlight(optics, band.columns), ray, sun, across, nu) if optics.scatterers else []
+    singles = lines.single(Sunlight(optics, band.columns, SUNLIGHT), ray, sun, across, nu) if optics.scatterers else []
     for k, single in zip(optics.scatterers, singles, strict=True):
         if is_peaked(optics.constituents[k]):
             peaks[k] = single

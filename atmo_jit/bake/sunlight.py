@@ -29,9 +29,10 @@ class Sunlight:
         self.table = stored([dr.exp(-d) for d in depths], lane, self.size)
 
     def at(self, row: Any, x: Any) -> list[Any]:
-        """Per channel (and padding), at a fractional row and at sqrt((mu_s - horizon) / (1 - horizon))."""
+        """Per channel (and padding), at ``row`` = sqrt(h / thickness) and ``x`` = sqrt((mu_s - horizon) / (1 -
+        horizon))."""
         t = types()
-        x = dr.minimum(x, 1.0) * (self.cosines - 1)
+        x, row = dr.minimum(x, 1.0) * (self.cosines - 1), row * (self.rows - 1)
         j, i = dr.minimum(t.Int(x), self.cosines - 2), dr.minimum(t.Int(row), self.rows - 2)
         fx, fy = x - t.Float(j), row - t.Float(i)
         corner = t.UInt(dr.fma(i, self.cosines, j))

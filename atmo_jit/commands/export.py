@@ -54,8 +54,6 @@ def command(
     Every file is read back before it gets its name. The error estimate in params.json compares these very tables with
     the solution that they were made from.
     """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out {shown(str(out), 200)}: is not a folder")
     options = Options(mu_s_min, _size(size), precision, colour, tolerance, orders, altitude_m, sun_zenith_deg, texels)
     with progress_bar("export", quiet=quiet) as advance:
         report = export(atmosphere, layout, out, options, advance)

@@ -67,7 +67,8 @@ def _of_views(
     atmosphere: str, views: Path, tolerance: float, orders: int | None, free: tuple[str, ...], ground: bool, disc: bool
 ) -> tuple[Plan, dict[str, Any]]:
     from atmo_jit.atmosphere import Atmosphere
-    from atmo_jit.plan import Needs, plan
+    from atmo_jit.needs import Needs
+    from atmo_jit.plan import plan
     from atmo_jit.views import load_views
 
     air, rays = Atmosphere.load(atmosphere), load_views(views)
@@ -80,7 +81,8 @@ def _of_scene(
     scene: str, definitions: tuple[str, ...], variant: str, tolerance: float, free: tuple[str, ...]
 ) -> tuple[Plan, dict[str, Any]]:
     from atmo_jit.commands.render import _mitsuba, _parameters
-    from atmo_jit.plan import Needs, plan
+    from atmo_jit.needs import Needs
+    from atmo_jit.plan import plan
     from atmo_jit.scenes import find
 
     path, parameters = find(scene), _parameters(definitions)
@@ -105,26 +107,45 @@ def checked(made: Plan, asked: dict[str, Any]) -> dict[str, Any]:
     """
     import resource
 
+    import numpy as np
+
     from atmo_jit.backend import floats
-    from atmo_jit.plan import compared
+    from atmo_jit.plan import compared, error_found
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(2):
         start = time.process_time()
         sky = made.solve()
-        _finish(sky.irradiance(floats([0.0]), floats([0.0])))
+        _finish(sky.irradiance(floats([0.0]), floats(np.radians(made.needs.suns_deg[:1]))))
         solve = time.process_time() - start
         start = time.process_time()
         _evaluate(made, sky, asked)
         views = time.process_time() - start
     mib = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
-    predicted = made.predicted
+    predicted, error = made.predicted, error_found(made, _seen(asked))
     notes = (
         compared(predicted.solve_cpu_s, solve, "solve", "CPU s"),
         compared(predicted.views_cpu_s, views, "views", "CPU s"),
         compared(predicted.mib, mib, "memory", "MiB"),
+        # What is found is a part of the error: that it is less says nothing.
+        compared(predicted.error_percent, max(error, predicted.error_percent), "error", "%"),
     )
-    return {"solve_cpu_s": solve, "views_cpu_s": views, "mib": mib, "notes": [note for note in notes if note]}
+    found = {"solve_cpu_s": solve, "views_cpu_s": views, "mib": mib, "error_percent": error}
+    return {**found, "notes": [note for note in notes if note]}
+
+
+def _seen(asked: dict[str, Any]) -> dict[str, Any]:
+    """The views that a plan is for; an observer looks anywhere."""
+    import numpy as np
+
+    from atmo_jit.views import check_views
+
+    if "views" in asked:
+        return asked["views"]
+    altitude, zenith = asked["observer"]
+    rng = np.random.default_rng(0)
+    seen = {"view_zenith_deg": np.degrees(np.arccos(rng.uniform(-1, 1, 500))), "azimuth_deg": rng.uniform(0, 180, 500)}
+    return check_views({"altitude_m": altitude, "sun_zenith_deg": zenith, **seen})
 
 
 def _evaluate(made: Plan, sky: Any, asked: dict[str, Any]) -> None:
@@ -178,7 +199,7 @@ def _text(made: Plan, result: dict[str, Any]) -> list[str]:
         found = result["check"]
         lines.append(
             f"{'found':26} solve {found['solve_cpu_s']:.3g} + views {found['views_cpu_s']:.3g} CPU s, "
-            f"{found['mib']:.0f} MiB"
+            f"{found['mib']:.0f} MiB, at least {found['error_percent']:.2g} % error"
         )
         lines += found["notes"] or ["predictions were within a factor of two"]
     return lines

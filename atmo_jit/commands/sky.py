@@ -24,6 +24,7 @@ from atmo_jit.views import load_views
     "--orders", type=click.IntRange(min=1), help="Scattering and reflection events; 1 = single scattering only."
 )
 @click.option("--method", type=click.Choice(["auto", "tables", "march"]), default="auto", show_default=True)
+@click.option("--gradient", metavar="NAME,...", default="", help="Parameters by which to differentiate the radiance.")
 @click.option("--no-ground", is_flag=True, help="Leave out the ground's own radiance.")
 @click.option("--sun-disc", is_flag=True, help="Add the sun's disc to views that meet it.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
@@ -34,6 +35,7 @@ def command(
     tolerance: float,
     orders: int | None,
     method: str,
+    gradient: str,
     no_ground: bool,
     sun_disc: bool,
     quiet: bool,
@@ -44,6 +46,9 @@ def command(
     VIEWS.npz: 1-D arrays of one length N: altitude_m, sun_zenith_deg, view_zenith_deg, azimuth_deg (view minus sun),
     and distance_m where rays stop early (inf: no stop).
     OUT.npz: radiance, transmittance, sun_irradiance, sky_irradiance, float32 [N, wavelengths], and meta (JSON text).
+    
+    With --gradient also d_radiance/NAME for a number and dlog_radiance/NAME for a list (by the logarithm of a common
+    factor); NAME is any dotted name of the atmosphere, or an array of the views.
     """
     if not 0.0 < tolerance < 1.0:  # also refuses NaN
         raise InputError(f"--tolerance is {tolerance}; must be a number between 0 and 1")
@@ -62,12 +67,14 @@ def command(
             ground=not no_ground,
             sun_disc=sun_disc,
             method=method,
+            gradient=[name.strip() for name in gradient.split(",") if name.strip()],
             progress=advance,
         )
     arrays = {
         name: np.asarray(getattr(result, name), dtype=np.float32)
         for name in ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
     }
+    arrays |= result.gradient
     with atomic_outputs(path) as (part,), open(part, "wb") as file:
         np.savez(file, **arrays, meta=np.array(json.dumps(result.meta)))
     if not quiet:

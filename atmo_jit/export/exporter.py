@@ -17,6 +17,7 @@ from typing import Any
 from .. import __version__
 from ..atmosphere import Atmosphere
 from ..errors import InputError
+from ..files import check_folder
 from .containers import document, write_all
 
 LAYOUTS = ("takram", "bruneton", "cosmoscout", "hillaire", "power3d", "native")
@@ -91,6 +92,7 @@ def export(
         raise InputError(f"precision: is {options.precision!r}; must be one of {', '.join(PRECISIONS)}")
     if options.texels not in (None, *TEXELS):
         raise InputError(f"texels: is {options.texels!r}; must be one of {', '.join(TEXELS)}")
+    folder = check_folder(out)
     air, clock = Atmosphere.load(atmosphere), Clock()
     if not air.constituents:
         raise InputError("atmosphere: has no constituents; an empty sky needs no tables")
@@ -105,9 +107,9 @@ def export(
         "atmosphere": air.to_dict(),
     }
     files = [*made.files, document("params.json", made.parameters)]
-    nbytes = write_all(Path(out), files)
+    nbytes = write_all(folder, files)
     clock.stage("write and read back")
-    return Report(Path(out), [f.name for f in files], nbytes, made.error, made.warnings, clock.seconds)
+    return Report(folder, [f.name for f in files], nbytes, made.error, made.warnings, clock.seconds)
 
 
 @dataclass

@@ -12,7 +12,7 @@ import numpy as np
 from .. import mapping
 from ..atmosphere import Atmosphere
 from ..backend import doubles
-from ..bake.client import SCATTERING, bruneton_tables, scattering_nodes
+from ..bake.client import SCATTERING, WHOLE, Block, bruneton_tables, scattering_nodes
 from ..bake.error import compare
 from ..errors import InputError
 from ..phase import RayleighPhase
@@ -58,6 +58,10 @@ def make(
         warnings.append(
             f"wavelengths_nm: {len(air.wavelengths_nm)} wavelengths are few for colours; ten between 380 and 720 nm "
             "are right within 2 %"
+        )
+    if mu_s_min != client.MU_S_MIN:
+        warnings.append(
+            f"mu-s-min: {mu_s_min:g} is not the client's default; without the muSMin of params.json twilight is wrong"
         )
     if layout == "bruneton" and air.mie and _red_alone_fails(air):
         warnings.append(
@@ -152,16 +156,22 @@ def _snippets(tables: ClientTables, size: tuple[int, int, int, int]) -> list[Fil
 
 
 def client_tables(
-    sky: Sky, colours: Channels, aerosol: Aerosol, mu_s_min: float, size: tuple[int, int, int, int]
+    sky: Sky,
+    colours: Channels,
+    aerosol: Aerosol,
+    mu_s_min: float,
+    size: tuple[int, int, int, int],
+    block: Block = WHOLE,
 ) -> ClientTables:
-    """Tables of three channels. An aerosol that is not the client's keeps its radiance at the texels."""
+    """Tables of three channels, or a ``block`` of those of scattering. An aerosol that is not the client's keeps its
+    radiance at the texels."""
     air = sky.atmosphere
 
     def weight(species: int, nu: np.ndarray) -> np.ndarray:
         return phase_ratio(air, species, aerosol.g, nu)
 
-    baked = bruneton_tables(sky, mu_s_min, size, None if aerosol.exact else weight)
-    _, _, _, nu = scattering_nodes(baked.mapping, size)
+    baked = bruneton_tables(sky, mu_s_min, size, None if aerosol.exact else weight, block)
+    _, _, _, nu = scattering_nodes(baked.mapping, size, block)
     higher = colours.radiance(baked.higher) / RayleighPhase().value(nu)[..., None].astype(np.float32)
     return ClientTables(
         baked.mapping,

@@ -77,11 +77,11 @@ def read(folder: Path, parameters: dict[str, Any]) -> Sky:
     try:
         return Sky(
             parameters["metadata"]["atmosphere"],
-            parameters["orders"],
-            parameters["tolerance"],
-            resolution,
-            suns,
-            [held[i] for i in sorted(held)],
+            orders=parameters["orders"],
+            tolerance=parameters["tolerance"],
+            resolution=resolution,
+            suns=suns,
+            held=[held[i] for i in sorted(held)],
         )
     except (KeyError, ValueError) as error:
         raise InputError(f"{str(folder / FILE)!r}: does not fit its params.json ({error})") from None

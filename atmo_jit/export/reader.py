@@ -26,10 +26,15 @@ def read(folder: str | Path) -> Any:
         raise InputError(f"{str(folder)!r}: is of the layout {layout!r}; can be read: {', '.join(READABLE)}")
     try:
         return import_module(f".{layout}", __package__).read(folder, parameters)
-    except (KeyError, TypeError) as error:
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{str(folder / 'params.json')!r}: lacks or misstates {error}") from None
 
 
 def parameters_of(folder: Path) -> dict[str, Any]:
     """The contents of params.json."""
-    return read_json(folder / "params.json", "folder", "the folder of an export, with its params.json")
+    found = read_json(folder / "params.json", "folder", "the folder of an export, with its params.json")
+    if not isinstance(found, dict):
+        raise InputError(f"{str(folder / 'params.json')!r}: is no JSON object")
+    return found

@@ -34,7 +34,7 @@ def textures(tables: ClientTables, warnings: list[str]) -> dict[str, np.ndarray]
     found = {}
     for name in ROLES:
         table = getattr(tables, TABLE.get(name, name))
-        alpha = halved(name, tables.single_mie[..., 0], []) if name == "scattering" else None
+        alpha = tables.single_mie[..., 0].astype(np.float16) if name == "scattering" else None
         found[name] = packed(halved(name, table, warnings), alpha, np.float16)
     return found
 

@@ -36,6 +36,7 @@ def result():
         "frontier": [{**own, "groups": groups(0.123)}, {**other, "groups": groups(4.56)}],
         "own_on_few": groups(0.321),
         "stages": {"solve": [{**stage, "gathers_per_s": 1e8, "instructions_per_s": 1e9}, {**stage, "wall_s": 1e-6}]},
+        "tables": [{"what": "sky view baked", "wall_ms": 1.5, "cpu_ms": 2.5}],
         "peers": [{"method": "sasktran2", "setting": "8 streams", "note": "version 1", "groups": groups(2.5)}],
         "skipped": [{"what": "GPU", "reason": "none"}],
         "seconds": 3.0,
@@ -51,7 +52,7 @@ def test_page(result):
     assert rows[2].endswith("| 0.123 / 0.123 | 0.123 / 0.123 | - |")
     assert "| bruneton2017 | size 1 | 2 | 4.56 |" in text and "`clear`, `hazy`" in text and "0.321" in text
     assert text.count("| a > b |") == 1 and "1.25" in text
-    assert "| sasktran2 | 8 streams | version 1 |" in text
+    assert "| sasktran2 | 8 streams | version 1 |" in text and "| sky view baked | 1.5 | 2.5 |" in text
     assert "](" not in frontier_page.page(result)
 
 

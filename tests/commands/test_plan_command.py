@@ -65,6 +65,7 @@ def test_json_says_the_same(run, views):
 def test_check_runs_it(run, views):
     result = found(run, "--atmosphere", "earth", "--views", views, "--tolerance", 0.1, "--check")["check"]
     assert result["solve_cpu_s"] > 0 and result["views_cpu_s"] > 0 and result["mib"] >= 0
+    assert 0 < result["error_percent"] < 5
     assert all("off by more than 2x" in note for note in result["notes"])
     _, text, _ = run("--atmosphere", "earth", "--views", views, "--tolerance", 0.1, "--check")
     assert any(line.startswith("found ") for line in text.splitlines())
@@ -76,6 +77,14 @@ def test_a_wrong_prediction_is_said(run, views, monkeypatch):
     monkeypatch.setattr(costs, "machine_factor", lambda: 1e4)
     notes = found(run, "--atmosphere", "earth", "--views", views, "--tolerance", 0.1, "--check")["check"]["notes"]
     assert any(note.startswith("solve: predicted") for note in notes)
+
+
+def test_an_error_that_is_larger_than_predicted_is_said(run, views, monkeypatch):
+    from atmo_jit import costs
+
+    monkeypatch.setattr(costs, "ERRORS", {0.1: (1e-4, 1e-4)})
+    notes = found(run, "--atmosphere", "earth", "--views", views, "--tolerance", 0.1, "--check")["check"]["notes"]
+    assert any(note.startswith("error: predicted 0.0001 %") for note in notes)
 
 
 @pytest.mark.parametrize("name", shipped())

@@ -277,3 +277,22 @@ def test_imports_nothing_slow_and_shows_no_bar_in_a_pipe(views, tmp_path):
     ]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0 set()\n", "")
+
+
+def test_derivatives_are_written_under_their_names(run, views, tmp_path):
+    out = tmp_path / "out.npz"
+    status, _, err = run(
+        *("--atmosphere", "earth", "--views", views, "--out", out, "--tolerance", 0.03, "--quiet"),
+        *("--gradient", "mie.phase.g,ground_albedo"),
+    )
+    assert status == 0, err
+    found = np.load(out)
+    for name in ("d_radiance/mie.phase.g", "dlog_radiance/ground_albedo"):
+        assert found[name].shape == (3, 3) and np.isfinite(found[name]).all()
+    assert np.all(found["dlog_radiance/ground_albedo"] > 0.0)
+
+
+def test_an_unknown_derivative_is_refused(refused, views):
+    line = refused("--gradient", "mie.phase.g,mie.beta", views=views)
+    assert "gradient: 'mie.beta' is no parameter; allowed are solar_irradiance, bottom_radius_m," in line
+    assert "distance_m" not in line and line.rstrip().endswith("azimuth_deg")

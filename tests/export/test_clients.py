@@ -88,6 +88,10 @@ def test_bruneton_comes_back_exactly(tmp_path):
     with pytest.raises(InputError, match="has 16 bytes"):
         read(tmp_path)
     assert report.nbytes > 0
+    for text in ("[]", "{}", '{"metadata": {"layout": "bruneton"}}', "nonsense"):
+        (tmp_path / "params.json").write_text(text)
+        with pytest.raises(InputError, match=r"params\.json|layout"):
+            read(tmp_path)
 
 
 def test_cosmoscout(tmp_path):
@@ -155,5 +159,7 @@ def test_the_command(tmp_path, capsys):
     assert json.loads((tmp_path / "t" / "params.json").read_text())["muSMin"] == -0.3
     assert main([*arguments, "--size", "4,8"]) == 2
     assert main([*arguments, "--precision", "half"]) == 2
+    (tmp_path / "file").touch()
+    assert main([*arguments[:-1], str(tmp_path / "file" / "t")]) == 2
     err = capsys.readouterr().err.splitlines()
-    assert len(err) == 2 and all(line.startswith("atmo-jit: ") for line in err)
+    assert len(err) == 3 and all(line.startswith("atmo-jit: ") for line in err)

@@ -179,6 +179,64 @@ def test_derivatives(rgb: None) -> None:
     np.testing.assert_allclose(slope, difference, rtol=0.01)
 
 
+def weighed(emitter) -> mi.Float:
+    """A sum of the sky's colours in a few directions, the ground among them, and not the sun."""
+    directions = np.array([sun(80.0), sun(50.0, 90.0), sun(10.0, 30.0), sun(-30.0)])
+    return dr.sum(sum(emitter.eval(looking(directions))) * mi.Float([1.0, 2.0, -1.0, 0.5]))
+
+
+@pytest.mark.parametrize("name", ["mie.phase.g", "rayleigh.scattering_per_m", "altitude"])
+def test_derivatives_by_the_atmosphere(name: str, rgb: None) -> None:
+    """Against differences of emitters, whose solves have an error of some 1e-3 that changes with the resolution."""
+    emitter = load(sun_direction=sun(35.0), mie_scattering_per_m=2e-5, mie_phase_g=0.7, altitude=2000.0)
+    parameters = mi.traverse(emitter)
+    value = type(parameters[name])(parameters[name])
+    dr.enable_grad(value)
+    parameters[name] = value
+    parameters.update()
+    dr.backward(weighed(emitter))
+    start = np.array(dr.detach(value), dtype=float)
+    slope = float(dr.grad(value).numpy() @ start)
+    ends, step = [], 0.01
+    for sign in (1, -1):
+        parameters[name] = mi.Float((start * (1.0 + sign * step)).tolist())
+        parameters.update()
+        ends.append(float(weighed(emitter)[0]))
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.06)
+
+
+@pytest.mark.slow
+def test_an_optimisation_finds_the_haze(rgb: None) -> None:
+    """The usual loop: render, compare, step. Two parameters of the aerosol from a picture of 64 x 32 pixels."""
+
+    def scene(**aerosol):
+        camera = {"type": "latlong", "film": {"type": "hdrfilm", "width": 64, "height": 32, "rfilter": {"type": "box"}}}
+        sky = {"type": "atmosphere", "sun_direction": sun(35.0), "sun_scale": 0.0, **aerosol}
+        return mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sensor": camera, "sky": sky})
+
+    picture = mi.render(scene(mie_scattering_per_m=1.5e-5, mie_phase_g=0.65), spp=16)
+    start = scene(mie_scattering_per_m=4e-6, mie_phase_g=0.8)
+    parameters = mi.traverse(start)
+    names = "sky.mie.phase.g", "sky.logarithm"
+    optimiser = mi.ad.Adam(lr=0.03)
+    optimiser[names[0]] = mi.Float(0.8)
+    optimiser[names[1]] = mi.Float(np.log(4e-6))
+    optimiser.set_learning_rate({names[1]: 0.2})
+    losses = []
+    for _ in range(25):
+        parameters[names[0]] = optimiser[names[0]]
+        parameters["sky.mie.scattering_per_m"] = dr.exp(optimiser[names[1]])
+        parameters.update()
+        difference = mi.render(start, parameters, spp=16) - picture
+        loss = dr.mean(dr.square(difference / (picture + 1e-3)), axis=None)
+        dr.backward(loss)
+        optimiser.step()
+        losses.append(float(loss.array[0]))
+    assert losses[-1] < 0.1 * losses[0]
+    assert float(optimiser[names[0]][0]) == pytest.approx(0.65, abs=0.05)
+    assert float(np.exp(optimiser[names[1]][0])) == pytest.approx(1.5e-5, rel=0.25)
+
+
 def test_frozen_functions(rgb: None) -> None:
     scene = mi.load_dict({"type": "scene", "sky": {"type": "atmosphere", "sun_direction": sun(40.0)}})
 

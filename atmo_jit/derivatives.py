@@ -1,0 +1,508 @@
+"""Derivatives of the sky with respect to everything it depends on.
+
+>>> import atmo_jit
+>>> views = {"altitude_m": 0.0, "sun_zenith_deg": 60.0, "view_zenith_deg": [0.0, 45.0], "azimuth_deg": 90.0}
+>>> at_earth = atmo_jit.linearize("earth", views)
+>>> at_earth.jacobian(["mie.scattering_per_m", "mie.phase.g"])["mie.phase.g"].shape  # views, wavelengths
+(2, 3)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .atmosphere import Atmosphere
+from .backend import doubles, evaluated, floats, traversing, types
+from .errors import InputError
+from .grid import Grid
+from .optics import Optics, on_device
+from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, per_wavelength, tangent
+from .pieces import Pieces
+from .recording import Recordings, copied
+from .resolution import Resolution
+from .sky import Sky
+from .views import check_views
+
+OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
+GEOMETRY = ("radius", "thickness")  # of Optics.values, and
+SHAPE = ("profiles", "sun_radius")  # with these, nothing that is kept with a grid serves
+PROFILE = ("scale_height_m", "center_m", "half_width_m")
+MANY = 1024  # views from which on it is worth to see whether they make a table
+RADIUS_STEP = 5e-3  # of the planet's radius, and
+THICKNESS_STEP = 2e-2  # of its atmosphere's thickness: the light is nearly linear over them
+
+
+class Linearization:
+    """The sky of an atmosphere for a list of views, and its derivatives there.
+
+    ``value``: what sky returns, by name: radiance, transmittance, sun_irradiance, sky_irradiance, float32 [N, W].
+    """
+
+    def __init__(
+        self,
+        atmosphere: Any,
+        views: Mapping[str, Any],
+        *,
+        tolerance: float = 0.01,
+        orders: int | None = None,
+        ground: bool = True,
+        sun_disc: bool = False,
+        resolution: Resolution | None = None,
+        layout: Atmosphere | None = None,
+    ) -> None:
+        self.atmosphere = Atmosphere.load(atmosphere)
+        self.views = check_views(views)
+        self._options = {"ground": ground, "sun_disc": sun_disc}
+        self._solving = {"orders": orders, "tolerance": tolerance}
+        too = [c.name for c in self.atmosphere.constituents]
+        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, layout=layout, sure=True, scattering_too=too)
+        r = self.sky.resolution
+        self._degrees, self._phase_degree = r.degrees, r.phase_degree
+
+    def moved(self, parameters: Mapping[str, Any]) -> Linearization:
+        """The linearization where parameters, arrays by name, have other values.
+
+        On the same nodes as long as they suit, so that it changes smoothly with the parameters, as a fit wants it.
+        Raises what Linearization raises, and InputError for an unknown name.
+        """
+        options: dict[str, Any] = {**self._solving, **self._options}
+        there, views = replaced(self.atmosphere, self.views, parameters)
+        needed = Resolution.suited(there, options["tolerance"])
+        if needed.first_degree <= self.sky.resolution.first_degree and Grid.suits(self.sky.layout, there):
+            options |= {"resolution": self.sky.resolution, "layout": self.sky.layout}
+        return Linearization(there, views, **options)
+
+    @property
+    def rays(self) -> int:
+        """N, the number of views."""
+        return len(self.views["altitude_m"])
+
+    @cached_property
+    def value(self) -> dict[str, np.ndarray]:
+        """See the class."""
+        evaluation, arguments = self._evaluating(by_views=False)
+        return self._arrays(evaluation(self._made, *arguments))
+
+    def jacobian(self, names: Sequence[str], output: str = "radiance") -> dict[str, np.ndarray]:
+        """Derivatives of one output by name: [N, W]; [N, W, n] for the n nodes of a profile.
+
+        Where the description has one number per wavelength, entry [i, w] is by the number of wavelength w: no other
+        matters there. Angles of views are in degrees, as their names say. Raises InputError for an unknown name.
+        """
+        names = check_names(self.atmosphere, names, self.views)
+        seeds = [
+            (name, direction)
+            for name in names
+            if name not in RADII
+            for direction in ([1.0] if name in VIEWS else directions(self.atmosphere, name))
+        ]
+        columns: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        for (name, _), column in zip(seeds, self._forward(seeds), strict=True):
+            columns[name].append(column[output])
+        for name in set(names) & set(RADII):
+            columns[name].append(self._by_radius(name)[output])
+        return {
+            name: np.stack(parts, axis=-1) if ".profile." in name else parts[0] for name, parts in columns.items()
+        }
+
+    def jvp(self, changes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Changes of all outputs, [N, W] by name, along changes of parameters (each of the shape of its parameter, or
+        one number for all of it). Raises InputError for an unknown name."""
+        names = check_names(self.atmosphere, tuple(changes), self.views)
+        total = {output: np.zeros(values.shape) for output, values in self.value.items()}
+        for name in set(names) & set(RADII):
+            total = {o: total[o] + float(changes[name]) * v for o, v in self._by_radius(name).items()}
+        seeds = [(name, changes[name]) for name in names if name not in RADII and np.any(changes[name])]
+        if seeds:
+            total = {o: total[o] + v for o, v in self._along(seeds).items()}
+        return total
+
+    def vjp(self, cotangents: Mapping[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Derivatives of sum(cotangents[output] * output) over the named outputs, by name, in reverse: one pass for
+        all, each of the shape of its parameter.
+
+        ``cotangents``: arrays [N, W] by output. Raises InputError for an unknown name.
+        """
+        names = check_names(self.atmosphere, names, self.views)
+        unknown = [name for name in cotangents if name not in OUTPUTS]
+        if unknown:
+            raise InputError(f"cotangents: {unknown[0]!r} is no output; allowed are {', '.join(OUTPUTS)}")
+        shape = self.rays, len(self.atmosphere.wavelengths_nm)
+        weights = [np.broadcast_to(np.asarray(cotangents.get(name, 0.0), np.float32), shape) for name in OUTPUTS]
+        of_values = sorted({group for name in names for group in self._groups(name)})
+        of_views = sorted(set(names) & set(VIEWS))
+        adjoints: tuple[Any, Any] = [], {}
+        if of_values or of_views:
+            columns = [floats(column) for column in np.concatenate(weights, axis=-1).T]
+            evaluation, arguments = self._evaluating(by_views=bool(of_views))
+            adjoints = evaluation.reverse(self._made, *arguments, columns, of_values, of_views)
+        found = {name: adjoints[1][name].numpy() for name in of_views}
+        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints[0]]
+        for name in names:
+            if name in RADII:
+                change = self._by_radius(name)
+                found[name] = np.sum([np.vdot(w, change[o]) for w, o in zip(weights, OUTPUTS, strict=True)])
+            elif name not in VIEWS:
+                found[name] = self._pulled_back(name, host)
+        return found
+
+    def _pulled_back(self, name: str, adjoints: list[dict[str, list[np.ndarray]]]) -> np.ndarray:
+        """Derivative by a parameter from those by the values of every band.
+
+        Channels do not mix between a parameter and the values, nor do nodes of a profile: one step of all of them
+        serves each.
+        """
+        value, nodes = described(self.atmosphere, name), ".profile." in name
+        found = np.zeros(np.shape(value))
+        for optics, numbers, adjoint in zip(self._optics, self._numbers, adjoints, strict=True):
+            step = tangent(optics, name, np.ones_like(value), self._degrees, self._phase_degree)
+            steps = like(numbers, step)
+            for group in self._groups(name):
+                along = flat(steps[group])
+                parts = [grad.reshape(len(d), -1)[:, : d.shape[1]] if d.ndim == 2 else grad.reshape(d.shape)
+                    for grad, d in zip(adjoint[group], along, strict=True)]
+                products = [a * b for a, b in zip(parts, along, strict=True)]
+                if nodes:
+                    found += sum(p for p, d in zip(products, along, strict=True) if np.any(d))
+                elif per_wavelength(self.atmosphere, name):
+                    found[optics.indices] += optics.by_channel(like(steps[group], products))
+                else:
+                    found += sum(np.sum(p) for p in products)
+        return found
+
+    def _groups(self, name: str) -> tuple[str, ...]:
+        """The values, by name, that carry derivatives when those by a parameter are asked for.
+
+        All values of a kind together, also those that the parameter does not move: parameters then share kernels.
+        """
+        if name in VIEWS or name in RADII:
+            return ()
+        if name == "sun_angular_radius_deg" or name.rpartition(".")[2] in PROFILE or ".profile." in name:
+            return SHAPE
+        return tuple(n for n in self._numbers[0] if n not in (*SHAPE, *GEOMETRY))
+
+    def gradients(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Derivatives of the radiance, [N, W] each, under the names that files have for them.
+
+        ``d_radiance/NAME``: by a number; ``dlog_radiance/NAME``: by the logarithm of a common factor of all numbers of
+        a list. Raises InputError for an unknown name.
+        """
+        found = {}
+        for name, values in self.jacobian(names).items():
+            value = 1.0 if name in VIEWS else described(self.atmosphere, name)
+            if np.ndim(value):
+                values = values @ value if ".profile." in name else values * value
+            found[f"{'dlog' if np.ndim(value) else 'd'}_radiance/{name}"] = values.astype(np.float32)
+        return found
+
+    # ---- how
+
+    def _by_radius(self, name: str) -> dict[str, np.ndarray]:
+        """Central differences of solves: all geometry of a solve is made for one planet, in double precision.
+
+        Two things change with a radius: the curvature and, the other radius being fixed, the thickness of the air.
+        """
+        air = self.atmosphere
+        by_thickness = self._difference(air.thickness_m * THICKNESS_STEP, lambda step: {"top_radius_m": step})
+        if name == "top_radius_m":
+            return by_thickness
+        by_curvature = self._difference(air.bottom_radius_m * RADIUS_STEP, lambda step: dict.fromkeys(RADII, step))
+        return {output: by_curvature[output] - by_thickness[output] for output in OUTPUTS}
+
+    def _elsewhere(self, atmosphere: Atmosphere) -> Linearization:
+        """The same for another atmosphere."""
+        return Linearization(
+            atmosphere, self.views, resolution=self.sky.resolution, **self._solving, **self._options
+        )
+
+    def _difference(self, step: float, changes: Callable[[float], dict[str, float]]) -> dict[str, np.ndarray]:
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = {name: getattr(self.atmosphere, name) + s for name, s in changes(sign * step).items()}
+            ends.append(self._elsewhere(self.atmosphere.replace(moved)).value)
+        return {output: (ends[0][output] - ends[1][output]) / (2.0 * step) for output in OUTPUTS}
+
+    @cached_property
+    def _numbers(self) -> list[dict[str, Any]]:
+        return [optics.numbers(optics.atmosphere, self._degrees, self._phase_degree) for optics in self._optics]
+
+    @cached_property
+    def _made(self) -> list[dict[str, Any]]:
+        return [on_device(part) for part in self._numbers]
+
+    @property
+    def _optics(self) -> list[Optics]:
+        return [band.optics for band in self.sky.solutions]
+
+    @cached_property
+    def _arguments(self) -> tuple[Any, ...]:
+        """What _Evaluation takes beside values: views, pieces of their rays, shares of the orders."""
+        views = {name: doubles(values) for name, values in self.views.items()}
+        rays, _, _ = self.sky.enter(*_where(views))
+        pieces = [Pieces.of(optics, rays) for optics in self._optics]
+        return views, pieces, [band.field.shares for band in self.sky.solutions]
+
+    @cached_property
+    def _product(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """View zenith angles and azimuths (degrees) of many views that are all combinations of the two, row by row,
+        seen from one place under one sun; None: they are not."""
+        views = self.views
+        single = all(np.ptp(views[name]) == 0.0 for name in VIEWS[:2])
+        inside = views["altitude_m"][0] <= self.atmosphere.thickness_m
+        if self.rays < MANY or "distance_m" in views or self._options["sun_disc"] or not (single and inside):
+            return None
+        zenith, azimuth = views["view_zenith_deg"], views["azimuth_deg"]
+        count = int(np.argmax(zenith != zenith[0])) or self.rays
+        rows = zenith[::count]
+        if self.rays % count or not np.array_equal(zenith, np.repeat(rows, count)):
+            return None
+        return (rows, azimuth[:count]) if np.array_equal(azimuth, np.tile(azimuth[:count], len(rows))) else None
+
+    def _evaluating(self, *, by_views: bool) -> tuple[Any, tuple[Any, ...]]:
+        """What evaluates the sky, and its arguments beside values."""
+        if by_views or self._product is None:
+            return self._evaluation, self._arguments
+        views = {name: doubles(values[:1]) for name, values in self.views.items()}
+        place = (self.views["altitude_m"][0], np.radians(self.views["sun_zenith_deg"][0]))
+        shares = [band.field.shares for band in self.sky.solutions]
+        return _TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product)), (views, None, shares)
+
+    @cached_property
+    def _evaluation(self) -> _Evaluation:
+        views, pieces, shares = self._arguments
+        sizes = [dr.width(views["altitude_m"]), *(part and part.count for part in pieces), *map(len, shares)]
+        key = [tuple(views), *sizes, *self._options.values(), *self._solving.values()]
+        key += [(optics.make_up, optics.phase_kinds) for optics in self._optics]
+        return self.sky.grid.kept(("evaluation", *key), lambda: _Evaluation(self.sky, self._options))
+
+    def _arrays(self, outputs: list[Any]) -> dict[str, np.ndarray]:
+        stacked = np.stack([v.numpy() for v in outputs], axis=-1)
+        return dict(zip(OUTPUTS, np.split(stacked, len(OUTPUTS), axis=-1), strict=True))
+
+    def _forward(self, seeds: list[tuple[str, Any]]) -> list[dict[str, np.ndarray]]:
+        """The derivative of all outputs along every seed, a name and a direction."""
+        return [self._along([seed]) for seed in seeds]
+
+    def _along(self, seeds: list[tuple[str, Any]]) -> dict[str, np.ndarray]:
+        """The derivative of all outputs along the sum of the seeds, names and directions."""
+        views, groups = None, sorted({group for name, _ in seeds for group in self._groups(name)})
+        if any(name in VIEWS for name, _ in seeds):
+            given = dict(seeds)
+            views = {n: doubles(np.broadcast_to(given.get(n, 0.0), v.shape)) for n, v in self.views.items()}
+        values = [] if groups else None
+        for optics, numbers in zip(self._optics, self._numbers, strict=True) if groups else ():
+            own = [(name, direction) for name, direction in seeds if name not in VIEWS]
+            parts = [tangent(optics, *seed, self._degrees, self._phase_degree) for seed in own]
+            steps = like(numbers, [sum(leaves) for leaves in zip(*parts, strict=True)])
+            values.append(on_device({group: steps[group] for group in groups}))
+        evaluation, arguments = self._evaluating(by_views=views is not None)
+        outputs, changes = evaluation.forward(self._made, *arguments, values, views)
+        self.__dict__.setdefault("value", self._arrays(outputs))
+        return self._arrays(changes)
+
+
+class _Evaluation:
+    """The outputs of a sky as a function of values, views, pieces of their rays, and shares of the orders.
+
+    It and its derivatives are recorded (dr.freeze) where they are asked for more than once: tracing costs several
+    times what running does.
+    """
+
+    def __init__(self, sky: Sky, options: dict[str, Any]) -> None:
+        self._sky, self._options = sky, options
+        self._recordings = Recordings(sky.grid)
+        self._recorded = all(optics.phase_kinds is not None for optics in (band.optics for band in sky.solutions))
+
+    def __call__(self, *arguments: Any) -> list[Any]:
+        """All outputs, one Float [N] each, in the order of OUTPUTS and wavelengths."""
+        return self._run("value", self._outputs, *arguments)
+
+    def forward(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
+        """Outputs, and how they change along ``values`` and ``views``, the last two arguments (None: not at all)."""
+        *_, values, views = arguments
+        return self._run(("forward", values and tuple(values[0]), views is None), self._forward, *arguments)
+
+    def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+        """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
+        them the weights, Floats [N] in the order of the outputs."""
+        *arrays, of_values, of_views = arguments
+
+        def function(values: Any, views: Any, pieces: Any, shares: Any, weights: Any) -> tuple[Any, Any]:
+            values, views = copied(values), copied(views)
+            wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
+            dr.enable_grad(wanted)
+            outputs = self._outputs(values, views, pieces, shares)
+            pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
+            for output, weight in pairs:
+                dr.set_grad(output, weight)
+            dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
+            dr.traverse(dr.ADMode.Backward)
+            adjoints = dr.grad(wanted)
+            dr.eval(adjoints)
+            return adjoints
+
+        return self._run(("reverse", *of_values, *of_views), function, *arrays)
+
+    def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        with traversing():
+            return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
+
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], shares: list[Any]) -> list[Any]:
+        sky = self._sky.again(values, shares)
+        where = _where(views)
+        light = sky.rays(*where, **self._options, pieces=pieces)
+        sun, scattered = sky.irradiance(where[0], where[1])
+        zero = dr.zeros(types().Float, dr.width(where[0]))
+        outputs = [v + zero for v in (*light.radiance, *light.transmittance, *sun, *scattered)]
+        dr.eval(outputs)
+        return outputs
+
+    def _forward(
+        self, values: Any, views: Any, pieces: Any, shares: Any, along_values: Any, along_views: Any
+    ) -> tuple[list[Any], list[Any]]:
+        values, views = copied(values), copied(views)
+        pairs = [pair for name in along_views or () for pair in [(views[name], along_views[name])]]
+        for made, steps in zip(values, along_values or (), strict=False):
+            pairs += [pair for name in steps for pair in zip(flat(made[name]), flat(steps[name]), strict=True)]
+        for leaf, _ in pairs:
+            dr.enable_grad(leaf)
+        outputs = self._outputs(values, views, pieces, shares)
+        for leaf, step in pairs:
+            dr.set_grad(leaf, step)
+        dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in pairs))
+        dr.traverse(dr.ADMode.Forward)
+        changes = dr.grad(outputs)
+        dr.eval(changes)
+        return dr.detach(outputs), changes
+
+
+class _TableEvaluation(_Evaluation):
+    """The same for all combinations of view zenith angles and azimuths (radians) from one place under one sun, far
+    faster than ray by ray (bundle.py); not recorded."""
+
+    def __init__(
+        self,
+        sky: Sky,
+        options: dict[str, Any],
+        altitude_m: float,
+        sun_zenith: float,
+        view_zenith: np.ndarray,
+        azimuth: np.ndarray,
+    ) -> None:
+        super().__init__(sky, options)
+        self._recorded = False
+        self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
+
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, shares: list[Any]) -> list[Any]:
+        t, sky = types(), self._sky.again(values, shares)
+        altitude, sun_zenith = self._place
+        ground = self._options["ground"]
+        light = sky.table(altitude, self._view_zenith, sun_zenith, self._azimuth, ground=ground)
+        lane = dr.arange(t.UInt, len(self._view_zenith) * len(self._azimuth))
+        rows = lane // len(self._azimuth)
+        transmittance = [dr.gather(t.Float, evaluated(v), rows) for v in light.transmittance]
+        sun, scattered = sky.irradiance(*(doubles([v]) for v in self._place))
+        zero = dr.zeros(t.Float, dr.width(lane))
+        outputs = [v + zero for v in (*light.radiance, *transmittance, *sun, *scattered)]
+        dr.eval(outputs)
+        return outputs
+
+
+def _where(views: dict[str, Any]) -> list[Any]:
+    """Arguments of Sky.rays."""
+    degree = np.pi / 180.0
+    return [views["altitude_m"], *(views[name] * degree for name in VIEWS[1:4]), views.get("distance_m")]
+
+
+def differentiable(
+    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
+) -> dict[str, list[Any]]:
+    """What sky returns as Dr.Jit arrays that derivatives pass through: by output, W Floats [N].
+
+    ``parameters``: by name, Dr.Jit arrays (of one number, or as many as the parameter has) that take the place of the
+    atmosphere's values, and of the ``views``. Derivatives go from the outputs back to them (dr.backward) and the other
+    way (dr.forward); on the way the solver is asked for Linearization.vjp and jvp. ``options``: see Linearization.
+
+    Raises what Linearization raises, and InputError for a name that is no parameter.
+    """
+    air = Atmosphere.load(atmosphere)
+    outputs = dr.custom(_operation(), dict(parameters), lambda values: moved_to(air, views, values, **options))
+    count = len(outputs) // len(OUTPUTS)
+    return {name: outputs[i * count : (i + 1) * count] for i, name in enumerate(OUTPUTS)}
+
+
+def moved_to(
+    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
+) -> Linearization:
+    """The linearization where ``parameters``, arrays by name, take the place of the atmosphere's and the views'."""
+    return Linearization(*replaced(Atmosphere.load(atmosphere), views, parameters), **options)
+
+
+def replaced(
+    air: Atmosphere, views: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> tuple[Atmosphere, dict[str, Any]]:
+    """Atmosphere and views with other values of parameters."""
+    views = dict(views)
+    changes = {}
+    for name in check_names(air, tuple(parameters)):
+        value = np.array(parameters[name], dtype=np.float64).ravel()
+        if name in VIEWS:
+            views[name] = value if len(value) > 1 else float(value[0])
+        elif np.ndim(described(air, name)):
+            changes[name] = value.tolist() if len(value) > 1 else np.full(np.shape(described(air, name)), value[0])
+        else:
+            changes[name] = value.tolist() if len(value) > 1 else float(value[0])
+    return air.replace(changes) if changes else air, views
+
+
+def shaped(gradient: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A derivative by a parameter in the shape in which the parameter was given: one number may stand for all."""
+    return np.sum(gradient).reshape(shape) if np.prod(shape) == 1 else gradient.reshape(shape)
+
+
+@lru_cache(maxsize=1)
+def _operation() -> type:
+    class SkyOperation(dr.CustomOp):
+        def eval(self, parameters: Any, linearized: Any) -> list[Any]:
+            self.kinds = {name: type(value) for name, value in parameters.items()}
+            self.sizes = {name: len(value) for name, value in parameters.items()}
+            with dr.suspend_grad():
+                self.at = linearized(parameters)
+                return [floats(column) for name in OUTPUTS for column in self.at.value[name].T]
+
+        def forward(self) -> None:
+            changes = {name: np.array(v, np.float64) for name, v in self.grad_in("parameters").items()}
+            moved = self.at.jvp({name: v if len(v) > 1 else v[0] for name, v in changes.items()})
+            self.set_grad_out([floats(column) for name in OUTPUTS for column in moved[name].T])
+
+        def backward(self) -> None:
+            columns = np.stack([np.broadcast_to(v.numpy(), self.at.rays) for v in self.grad_out()], axis=-1)
+            weights = dict(zip(OUTPUTS, np.split(columns, len(OUTPUTS), axis=-1), strict=True))
+            found = self.at.vjp(weights, tuple(self.kinds))
+            self.set_grad_in(
+                "parameters",
+                {n: kind(shaped(found[n], (self.sizes[n],)).tolist()) for n, kind in self.kinds.items()},
+            )
+
+        def name(self) -> str:
+            return "sky"
+
+    return SkyOperation
+
+
+def linearize(atmosphere: Any, views: Mapping[str, Any], **options: Any) -> Linearization:
+    """The sky and its derivatives at an atmosphere, for a list of views: see Linearization, which takes the same."""
+    return Linearization(atmosphere, views, **options)
+
+
+def jacobian(
+    atmosphere: Any, views: Mapping[str, Any], names: Sequence[str], **options: Any
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Radiance [N, W] and its derivatives by name (Linearization.jacobian)."""
+    at = Linearization(atmosphere, views, **options)
+    return at.value["radiance"], at.jacobian(names)

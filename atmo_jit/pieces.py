@@ -1,0 +1,194 @@
+"""The light of march.py in steps that derivatives pass through, forwards and backwards.
+
+A march is a loop whose every turn needs the one before, and nothing can be propagated backwards through such a loop
+without its whole history. Here rays are cut first, without derivatives: where a ray is cut does not matter to its
+light. Then all pieces are integrated side by side, and what remains are sums over the pieces of a ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from .backend import evaluated, row, table_of, types
+from .column import SunColumns
+from .geometry import altitude_along
+from .march import (
+    NODES,
+    Cuts,
+    Light,
+    Rays,
+    Rule,
+    Source,
+    point_along,
+    relative_azimuth,
+    unfinished,
+    visible_sun,
+)
+from .optics import Optics
+
+
+@dataclass
+class Pieces:
+    """Pieces of rays, ray after ray: ``first`` [N + 1]: where those of each ray start. Per piece: ``ray``, ``start``
+    and ``length`` (m); ``closes``: it reaches the end of the ray. After the last come some of no length that no ray
+    has. ``rule``: rows of march.Rule by which all are integrated."""
+
+    first: Any
+    ray: Any
+    start: Any
+    length: Any
+    closes: Any
+    rule: Any
+
+    @property
+    def count(self) -> int:
+        """How many there are, of all rays."""
+        return dr.width(self.start)
+
+    @classmethod
+    def of(cls, optics: Optics, rays: Rays) -> Pieces | None:
+        """The pieces that march.march would integrate; None: no ray meets air."""
+        t, kinds = types(), len(optics.constituents)
+        if not kinds:
+            return None
+        with dr.suspend_grad():
+            cuts, rule = Cuts(optics, rays), Rule(1)
+            width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
+
+            def cut(store: Any) -> Any:
+                def piece(d: Any, shell: Any, amounts: list[Any], number: Any) -> tuple[Any, ...]:
+                    end, shell = cuts.after(d, shell)
+                    if store is not None:
+                        store(number, d, end)
+                    density = [
+                        optics.densities(altitude_along(optics.radius, rays.h, rays.mu, dr.fma(end - d, x, d))[0])
+                        for x in rule.few_x
+                    ]
+                    more = [dr.fma(end - d, rule.sum(rule.few_w, density, k), amounts[k]) for k in range(kinds)]
+                    return end, shell, more, number + 1
+
+                zero = dr.zeros(t.Float, width)
+                amounts = [dr.zeros(t.Float, width) for _ in range(kinds)]
+                state = (zero, cuts.first_shell(), amounts, dr.zeros(t.UInt, width))
+                return dr.while_loop(
+                    state, lambda d, _, amounts, __: unfinished(optics, rays, d, amounts), piece, label="cut"
+                )[-1]
+
+            counts = cut(None)
+            ends = dr.cumsum(counts)
+            dr.eval(ends)
+            total = int(ends[width - 1])
+            if total == 0:
+                return None
+            total = _room(total)
+            ray, start, length = dr.zeros(t.UInt, total), dr.zeros(t.Float, total), dr.zeros(t.Float, total)
+            closes, before = dr.zeros(t.UInt, total), ends - counts
+            lane = dr.arange(t.UInt, width)
+
+            def store(number: Any, d: Any, end: Any) -> None:
+                place = before + number
+                dr.scatter(ray, lane, place)
+                dr.scatter(start, d, place)
+                dr.scatter(length, end - d, place)
+                dr.scatter(closes, dr.select(end >= rays.stop, t.UInt(1), t.UInt(0)), place)
+
+            dr.eval(cut(store), ray, start, length, closes)
+            first = dr.zeros(t.UInt, width + 1)
+            dr.scatter(first, ends, lane + 1)
+            dr.eval(first)
+            closes = closes > 0
+            dr.eval(closes)
+        return cls(first, ray, start, length, closes, Rule(NODES).rows)
+
+
+def light_along(
+    optics: Optics,
+    columns: SunColumns,
+    rays: Rays,
+    pieces: Pieces | None,
+    *,
+    source: Source | None = None,
+) -> Light:
+    """What march.march returns, differentiable with respect to everything that enters."""
+    t, channels, kinds = types(), optics.channel_count, len(optics.constituents)
+    width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
+    if pieces is None:
+        zero = [dr.zeros(t.Float, width) for _ in range(channels)]
+        return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(channels)])
+    lane, rule = dr.arange(t.UInt, pieces.count), Rule(NODES, pieces.rule)
+    full = dr.zeros(t.Float, width)
+    members = [evaluated(v + full) for v in (rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop)]
+    h, mu, mu_s, nu, stop = (dr.gather(t.Float, v, pieces.ray) for v in members)
+    here, start = Rays(h, mu, mu_s, nu, stop, pieces.closes), pieces.start
+    length = dr.select(pieces.closes, stop - start, pieces.length)
+    density = [
+        optics.densities(altitude_along(optics.radius, h, mu, dr.fma(length, x, start))[0]) for x in rule.few_x
+    ]
+    own = table_of([length * rule.sum(rule.few_w, density, k) for k in range(kinds)], lane)
+    amounts = _sums(own, dr.gather(t.UInt, pieces.first, pieces.ray), lane, kinds)
+    phases = {k: optics.phase_values(k, nu) for k in optics.scatterers}
+    scatterers = optics.scatterers
+
+    def node(g: Any, one: list[Any], weight: list[Any], centroid: Any, total: Any) -> tuple[Any, ...]:
+        x, w, *running = rule.at(g)
+        altitude, r, sun = point_along(optics, here, dr.fma(length, x, start))
+        inside = [dr.fma(length, rule.sum(running, density, k), amounts[k]) for k in range(kinds)]
+        seen = [dr.exp(-depth) * (length * w) for depth in optics.optical_depths(inside)]
+        there = optics.densities(altitude)
+        sun_depths = optics.optical_depths(columns.toward(altitude, sun))
+        fraction = visible_sun(optics, altitude, r, sun)
+        lit = [s * dr.exp(-depth) * fraction for s, depth in zip(seen, sun_depths, strict=True)]
+        one, weight = list(one), list(weight)
+        for n, k in enumerate(scatterers):
+            for c in range(channels):
+                coefficient = optics.scattering[k][c] * there[k]
+                one[c] = dr.fma(coefficient * phases[k][c], lit[c], one[c])
+                if source is not None:
+                    share = coefficient * seen[c]
+                    weight[n * channels + c] = weight[n * channels + c] + share
+                    total, centroid = total + share, dr.fma(share, x, centroid)
+        return g + 1, one, weight, centroid, total
+
+    zeros = [dr.zeros(t.Float, pieces.count) for _ in range(channels * (1 + len(scatterers)) + 2)]
+    state = (t.UInt(0), zeros[:channels], zeros[channels:-2], zeros[-2], zeros[-1])
+    _, one, weight, centroid, total = dr.while_loop(
+        state, lambda g, *_: g < rule.count, node, max_iterations=-1, label="nodes apart"
+    )
+    more = [dr.zeros(t.Float, pieces.count) for _ in range(channels)]
+    if source is not None:
+        at = dr.fma(length, dr.select(total > 0.0, centroid / dr.select(total > 0.0, total, 1.0), 0.5), start)
+        altitude, r, sun = point_along(optics, here, at)
+        there = dr.clip(dr.fma(optics.radius + h, mu, at) / r, -1.0, 1.0)
+        toward = source.scattered(altitude, sun, there, relative_azimuth(there, sun, nu), total > 0.0)
+        for n in range(len(scatterers)):
+            for c in range(channels):
+                more[c] = dr.fma(weight[n * channels + c], toward[n][c], more[c])
+    ray = dr.arange(t.UInt, width)
+    bounds = [dr.gather(t.UInt, pieces.first, ray + i) for i in (0, 1)]
+    sums = _sums(table_of([*one, *more], lane), *bounds, 2 * channels)
+    depths = optics.optical_depths(_sums(evaluated(own), *bounds, kinds))
+    return Light(
+        [radiance * solar for radiance, solar in zip(sums[:channels], optics.solar, strict=True)],
+        sums[channels:],
+        [dr.exp(-depth) for depth in depths],
+    )
+
+
+def _room(count: int) -> int:
+    """Pieces for which there is room: sizes that seldom change between atmospheres, so that recordings serve."""
+    step = 1 << max(count.bit_length() - 4, 4)
+    return -(-count // step) * step
+
+
+def _sums(table: Any, start: Any, stop: Any, count: int) -> list[Any]:
+    """Sums of the rows from ``start`` to ``stop`` of a table of rows of ``count``."""
+    t = types()
+
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        return i + 1, [s + v for s, v in zip(sums, row(table, i, count), strict=True)]
+
+    zero = [dr.zeros(t.Float, dr.width(stop)) for _ in range(count)]
+    return dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="sum of rows")[1]

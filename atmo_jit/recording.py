@@ -1,0 +1,54 @@
+"""Functions of Dr.Jit arrays that are recorded when called again (dr.freeze), and played back from then on.
+
+A solve is a hundred small kernels, and tracing them costs more than running them.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+
+from .grid import Grid
+
+
+class Recordings:
+    """Recordings of functions whose arguments hold all that changes; what they read beside is kept with a grid.
+
+    The first call of each is plain, since it makes what is kept. Derivatives do not pass through a recording: a
+    function that is recorded may propagate them inside.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._recorded: dict[Any, Callable[..., Any]] = {}
+        self._used: set[Any] = set()
+
+    def run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What ``function`` returns; ``key`` tells functions apart."""
+        if key not in self._used:
+            self._used.add(key)
+            return function(*arguments)
+        if key not in self._recorded:
+            arrays = self._grid.arrays()
+            self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
+        # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
+        # collector has to wait.
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return self._recorded[key](*arguments)
+        finally:
+            if collects:
+                gc.enable()
+
+
+def copied(tree: Any) -> Any:
+    """Dictionaries and lists of arrays of their own: derivatives that these carry do not show on the originals."""
+    if isinstance(tree, dict):
+        return {key: copied(part) for key, part in tree.items()}
+    if isinstance(tree, list):
+        return [copied(part) for part in tree]
+    return type(tree)(tree)

@@ -1,0 +1,204 @@
+"""Light that the air sends along a ray of the scene, what it takes of the light behind, and the planet's ground: from
+the solved atmosphere, for the integrator ``atmosphere_path``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from atmo_jit.bake.source import SourceTable
+from atmo_jit.geometry import altitude_along, hits_ground
+from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, visible_sun
+from atmo_jit.quadrature import gauss_legendre
+from atmo_jit.resolution import moments_of
+from atmo_jit.single_scattering import disc_cosine
+from atmo_jit.sky import Sky
+
+from .globe import Globe
+
+NODES = 2  # of each piece of a ray: 0.04 % of radiance beside the four of Sky.rays
+GOLDEN = 0.6180339887
+QUADRATURE = gauss_legendre(4)
+FIRST_PARTS = 4  # of the way to where shadows may begin
+FULL_DEPTH = 0.25  # optical depth from which a stretch gets all of its points
+LEAST_EXTINCTION = 1e-9  # 1/m: thinner air makes points even in distance
+
+
+@dataclass
+class Stretch:
+    """A ray's way through the air; lists have one entry for each of the atmosphere's W wavelengths.
+
+    ``light`` scattered by the air (radiance, nothing in the sun's way) and ``transmittance`` of all of it; ``ground``:
+    it ends on the planet's ground, ``distance`` (scene units) where. ``rays``: in metres, from where the ray enters the
+    air, after ``gap``.
+    """
+
+    light: list[Any]
+    transmittance: list[Any]
+    ground: Any
+    distance: Any
+    rays: Rays
+    gap: Any
+
+
+class Airlight:
+    """The air of a solved ``sky`` around ``globe``, lit by a sun in the direction ``sun`` (unit vector, scene)."""
+
+    def __init__(self, sky: Sky, globe: Globe, sun: np.ndarray) -> None:
+        self.sky, self.globe = sky, globe
+        self.bands = sky.bands
+        self._shells = [Shells(band.optics) for band in self.bands]
+        # Light of one order has nothing but the sun's own beam to lose.
+        self._beams = [beam_extinction(band.optics, scaled=sky.orders != 1) for band in self.bands]
+        self._sources = [band.source and SourceTable(band.field) for band in self.bands]
+        for shells in self._shells:
+            shells.rule(NODES)
+            dr.eval(shells.densest)
+        self.count = len(sky.atmosphere.wavelengths_nm)
+        ground = [band.optics.largest_extinction(band.optics.densities(mi.Float(0.0))) for band in self.bands]
+        self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
+        self.sun = mi.Vector3f(*(float(v) for v in sun))
+        dr.make_opaque(self.sun)
+
+    def along(self, ray: Any, length: Any) -> Stretch:
+        """The air between a ray's origin and ``length`` (scene units, inf: to the end)."""
+        scale = self.globe.scale
+        optics = self.bands[0].optics
+        top, radius = optics.thickness, optics.radius
+        h, mu, mu_s, nu = self.globe.cosines(ray.o, ray.d, self.sun)
+        outside = h > top
+        r = radius + h
+        # From outside the ray starts where it enters: the nearer root of d^2 + 2 r mu d + excess = 0.
+        excess = dr.select(outside, (h - top) * (2.0 * radius + h + top), 0.0)
+        square = dr.fma(r * mu, r * mu, -excess)
+        meets = ~outside | ((mu < 0.0) & (square > 0.0))
+        gap = dr.select(outside & meets, excess / (dr.safe_sqrt(square) - r * mu), 0.0)
+        r_in = dr.select(outside, radius + top, r)
+        mu, mu_s = (
+            dr.select(outside, dr.clip(v, -1.0, 1.0), v)
+            for v in (dr.fma(r, mu, gap) / r_in, dr.fma(r, mu_s, gap * nu) / r_in)
+        )
+        rays = rays_to_boundary(optics, dr.minimum(h, top), mu, mu_s, nu)
+        left = dr.maximum(length * (1.0 / scale) - gap, 0.0)
+        rays.ground &= meets & (left >= rays.stop)
+        rays.stop = dr.select(meets, dr.minimum(rays.stop, left), 0.0)
+        found = Stretch([], [], rays.ground, (gap + rays.stop) * scale, rays, gap)
+        for band, source, shells in zip(self.bands, self._sources, self._shells, strict=True):
+            light = march(band.optics, band.columns, rays, nodes=NODES, source=source, shells=shells)
+            found.light += [a + b for a, b in zip(light.single, light.multiple, strict=True)]
+            found.transmittance += light.transmittance
+        return found
+
+    def on_ground(self, p: Any, lit: Any) -> list[Any]:
+        """Radiance (W) of the planet's ground at a point; ``lit``: the part of sunlight that nothing keeps away."""
+        zero = dr.zeros(mi.Float, dr.width(p))
+        _, mu_s, _, _ = self.globe.cosines(p, self.sun, self.sun)
+        found = []
+        for band in self.bands:
+            sky = band.field.irradiance(zero, mu_s, reflected=True)
+            sun = self._sunlight(band, zero, mu_s, disc_cosine(mu_s, band.optics.sun_radius) * lit)
+            found += [a * dr.inv_pi * (d + s) for a, d, s in zip(band.optics.albedo, sun, sky, strict=True)]
+        return found
+
+    def sunlight(self, p: Any, d: Any) -> list[Any]:
+        """Irradiance (W) across the direction ``d`` of a sun of which that one point shines; 0 where the planet is in
+        its way."""
+        optics = self.bands[0].optics
+        h, mu, _, _ = self.globe.cosines(p, d, self.sun)
+        # Beyond the top a ray that enters the air again has its whole column: from the top, twice to the perigee.
+        r_in = optics.radius + dr.minimum(h, optics.thickness)
+        sine = (optics.radius + h) / r_in * dr.safe_sqrt((1.0 - mu) * (1.0 + mu))
+        inside = (h <= optics.thickness) | ((mu < 0.0) & (sine < 1.0))
+        at_top = -dr.safe_sqrt((1.0 - sine) * (1.0 + sine))
+        mu = dr.select(h > optics.thickness, dr.select(inside, at_top, 1.0), mu)
+        h = dr.minimum(h, optics.thickness)
+        seen = dr.select(hits_ground(optics.radius, h, mu) & inside, 0.0, 1.0)
+        found = []
+        for band in self.bands:
+            found += self._sunlight(band, h, mu, seen)
+        return found
+
+    def _sunlight(self, band: Any, h: Any, mu: Any, factor: Any) -> list[Any]:
+        optics = band.optics
+        depths = optics.optical_depths(band.columns.toward(h, mu)) if optics.constituents else [0.0] * len(optics.solar)
+        return [e * factor * dr.exp(-depth) for e, depth in zip(optics.solar, depths, strict=True)]
+
+    def shade(
+        self, part: Stretch, start: Any, end: Any, sample: Any, most: int, lit: Callable[[Any], Any]
+    ) -> list[Any]:
+        """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it: of order 1, and of
+        higher orders what comes from so near the sun that the same shapes are in its way (:func:`beam_extinction`).
+
+        They can do so only between the distances ``start`` and ``end`` (scene units). There up to ``most`` points are
+        drawn, fewer where little is scattered: one from each of as many parts of equal weight exp(-distance x
+        extinction at the start), by the random number ``sample``. ``lit`` says of distances where the sun is seen (1 or
+        0)."""
+        rays, scale = part.rays, self.globe.scale
+        optics = self.bands[0].optics
+        first = dr.clip(start * (1.0 / scale) - part.gap, 0.0, rays.stop)
+        length = dr.clip(end * (1.0 / scale) - part.gap, 0.0, rays.stop) - first
+        before = [0.0 for _ in optics.constituents]
+        amounts = self._columns(rays, dr.zeros(mi.Float, dr.width(first)), first, before, FIRST_PARTS)
+        h, _, _ = point_along(optics, rays, first)
+        rate = dr.maximum(optics.largest_extinction(optics.densities(h)), LEAST_EXTINCTION)
+        rest = dr.exp(-rate * length)
+        count = dr.clip(dr.ceil(most * (1.0 - rest) / FULL_DEPTH), 1.0, float(most))
+        count = dr.select(length > 0.0, count, 0.0)
+        phases = [{k: band.optics.phase_values(k, rays.nu) for k in band.optics.scatterers} for band in self.bands]
+
+        def part_of(i: Any, d: Any, amounts: list[Any], sums: list[Any]) -> tuple[Any, ...]:
+            jitter = sample + i * GOLDEN
+            s = (i + (jitter - dr.floor(jitter))) / count
+            left = dr.fma(s, rest - 1.0, 1.0)
+            there = dr.minimum(first - dr.log(left) / rate, first + length)
+            amounts = self._columns(rays, d, there, amounts, 1)
+            h, r, mu_s = point_along(optics, rays, there)
+            inverse_density = (1.0 - rest) / (rate * left * count)
+            dark = (1.0 - lit((part.gap + there) * scale)) * visible_sun(optics, h, r, mu_s) * inverse_density
+            new = []
+            for band, beam, values in zip(self.bands, self._beams, phases, strict=True):
+                o = band.optics
+                here, toward = o.densities(h), band.columns.toward(h, mu_s)
+                for c, depth in enumerate(o.optical_depths(amounts)):
+                    sun_depth = sum(e[c] * n for e, n in zip(beam, toward, strict=True))
+                    scattered = sum(o.scattering[k][c] * values[k][c] * here[k] for k in o.scatterers)
+                    new.append(scattered * dr.exp(-depth - sun_depth) * dark * o.solar[c])
+            return i + 1.0, there, amounts, [a + b for a, b in zip(sums, new, strict=True)]
+
+        zero = dr.zeros(mi.Float, dr.width(first))
+        state = (zero + 0.0, first + 0.0, amounts, [zero + 0.0 for _ in range(self.count)])
+        *_, sums = dr.while_loop(state, lambda i, *_: i < count, part_of, label="shafts")
+        return sums
+
+    def _columns(self, rays: Rays, start: Any, end: Any, amounts: list[Any], parts: int) -> list[Any]:
+        """Column densities (m) of all constituents up to ``end``, given those up to ``start``."""
+        optics = self.bands[0].optics
+        length = (end - start) * (1.0 / parts)
+        for i in range(parts):
+            for x, w in zip(*QUADRATURE, strict=True):
+                h, _ = altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, float(x) + i, start))
+                amounts = [dr.fma(length * float(w), v, a) for v, a in zip(optics.densities(h), amounts, strict=True)]
+        return amounts
+
+
+
+def beam_extinction(optics: Any, *, scaled: bool) -> list[Any]:
+    """Extinction (1/m) [constituent][channel] of what shapes take away when they shade the air: of sunlight, and,
+    ``scaled``, of the light that was scattered so little aside that the same shapes are in its way.
+
+    Of every scattering the part chi_2, the second moment of the phase function, counts as not scattered (Joseph,
+    Wiscombe and Weinman 1976)."""
+    found = []
+    for k, c in enumerate(optics.constituents):
+        forward = [0.0] * optics.channel_count
+        if scaled and c.phase is not None:
+            forward = [float(moments_of(c.phase.at(int(i)), 2)[2]) for i in optics.indices]
+        found.append([e - f * s for e, f, s in zip(optics.extinction[k], forward, optics.scattering[k], strict=True)])
+    dr.make_opaque(found)
+    return found

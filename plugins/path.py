@@ -1,0 +1,304 @@
+"""The integrator plugin ``atmosphere_path``: surfaces in the light of sun and sky, with air in between."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from atmo_jit.atmosphere import Atmosphere
+from atmo_jit.errors import AtmosphereError, InputError, shown
+from atmo_jit.sky import Sky
+
+from . import settings
+from .airlight import Airlight
+from .colours import Colours
+from .globe import Globe
+from .shadow_volume import shadowed_interval
+from .skylight import Skylight
+from .volpath import mis_weight, unpolarized
+
+# Shapes lie in valleys at most this deep (m): below it the planet's ground hides them.
+DEEPEST_M = 500.0
+LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
+SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
+AOVS = ("inscatter", "transmittance")
+
+
+class AtmospherePath:
+    """
+    .. _integrator-atmosphere_path:
+
+    Path tracer with aerial perspective (:monosp:`atmosphere_path`)
+    ---------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - atmosphere
+       - |string|
+       - The atmosphere: a preset, the name of a JSON file, or the JSON text itself. Values of the atmosphere may be
+         replaced by their dotted names, as for the emitter. (Default: that of the scene's emitter ``atmosphere``)
+
+     * - center
+       - |point|
+       - Centre of the planet in scene units. (Default: so that the scene's origin is at the emitter's ``altitude``)
+
+     * - scale
+       - |float|
+       - Scene units per metre. (Default: 1)
+
+     * - max_depth
+       - |int|
+       - As for ``path``: 1 = what is seen directly, 2 = one reflection by a surface; -1 = no limit. Light that the air
+         scatters has all orders whatever this is. (Default: -1)
+
+     * - rr_depth
+       - |int|
+       - From this depth on, paths that carry little light are ended by chance. (Default: 5)
+
+     * - hide_emitters
+       - |bool|
+       - Leave out what is behind all shapes: sky, sun, the planet's ground. (Default: false)
+
+     * - orders
+       - |int|
+       - How often light is scattered in the air or reflected by the planet's ground, at most. (Default: no limit)
+
+     * - shaft_samples
+       - |int|
+       - Points of each segment, at most, at which it is found out whether shapes keep the sun from the air: shafts of
+         light and shadow. 0 leaves them out. (Default: 8)
+
+     * - aovs
+       - |string|
+       - ``inscatter``, ``transmittance`` or both, separated by a comma: light scattered into the camera's ray by the
+         air in front of what it meets, and the transmittance of that air (of white sunlight). (Default: none)
+
+    Renders any scene that has one emitter :ref:`atmosphere <emitter-atmosphere>`. Surfaces are lit by the sun, by the
+    sky as it is at their own place and altitude, by each other and by the scene's other lamps; on the way from each
+    surface to the next, and to the camera, the air takes its part of the light and adds what it scatters. That is
+    integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
+    where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
+    points, more where it scatters more. Scenes too small for that to matter skip it. With the sun goes the light that
+    has been scattered forward, from about the sun; other light of higher orders is that of the planet without shapes,
+    so the air in a shadow is brighter than it should be (docs/accuracy.md says by how much).
+
+    Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
+    of the sun (but do not occlude the sky). Cameras may be in the air or in space.
+
+    Reflectances are colours, air is a matter of wavelengths: each path carries one factor for every channel and one
+    for every wavelength, and the picture is what the rule of the emitter makes of both. Vectorised, unpolarised
+    variants only. Media, and ``null`` surfaces with them, are not supported.
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: atmosphere-path
+
+            <integrator type="atmosphere_path">
+                <integer name="max_depth" value="6"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'atmosphere_path',
+            'max_depth': 6
+    """
+
+    def __init__(self, props: Any) -> None:
+        mi.SamplingIntegrator.__init__(self, props)
+        if not dr.is_jit_v(mi.Float) or mi.is_polarized:
+            raise AtmosphereError("variant", mi.variant(), "an llvm_ad_* or cuda_ad_* variant that is not polarised")
+        self.max_depth, self.rr_depth = int(props.get("max_depth", -1)), int(props.get("rr_depth", 5))
+        if self.max_depth < -1:
+            raise AtmosphereError("max_depth", shown(self.max_depth), "a whole number >= 0, or -1 for no limit")
+        self.hide_emitters = bool(props.get("hide_emitters", False))
+        self.shaft_samples = int(props.get("shaft_samples", 8))
+        if self.shaft_samples < 0:
+            raise AtmosphereError("shaft_samples", shown(self.shaft_samples), "a whole number >= 0")
+        self.scale = settings.number(props, "scale", 1.0)
+        if self.scale <= 0.0:
+            raise AtmosphereError("scale", shown(self.scale), "a number > 0")
+        self.center = np.array(props["center"], dtype=np.float64) if "center" in props else None
+        self.orders = int(props["orders"]) if "orders" in props else None
+        self.atmosphere: Atmosphere | None = None
+        if "atmosphere" in props:
+            found = settings.atmosphere_of(props, lambda name: str(mi.file_resolver().resolve(name)))
+            self.atmosphere = found.replace(dict(settings.overrides(props, found)))
+        self.aovs = [name.strip() for name in str(props.get("aovs", "")).split(",") if name.strip()]
+        for name in self.aovs:
+            if name not in AOVS:
+                raise AtmosphereError("aovs", shown(name), f"{' and '.join(AOVS)}, separated by a comma")
+        self._held: tuple[Any, ...] | None = None
+
+    def aov_names(self) -> list[str]:
+        count = len(mi.UnpolarizedSpectrum(0.0))
+        letters = "RGB" if mi.is_rgb else [str(i) for i in range(count)]
+        return [f"{name}.{letter}" for name in self.aovs for letter in letters[:count]]
+
+    @dr.syntax
+    def sample(
+        self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+    ) -> tuple[Any, Any, list[Any]]:
+        light, air, colours = self._parts(scene)
+        lamps = [e for e in scene.emitters() if e is not light.emitter]
+        lamp_list = light.pointers(lamps)
+        context = mi.BSDFContext()
+        most = mi.UInt32(0xFFFFFFFF if self.max_depth < 0 else self.max_depth)
+
+        # Cameras do not see beyond their far_clip, but skies end nowhere.
+        ray = mi.Ray3f(dr.detach(ray.o), dr.detach(ray.d), ray.time, ray.wavelengths)
+        depth = mi.UInt32(0)
+        result = mi.UnpolarizedSpectrum(0.0)
+        reflected = mi.UnpolarizedSpectrum(1.0)  # by the surfaces of the path, for each channel
+        passed = [mi.Float(1.0) for _ in range(air.count)]  # the air of the path, for each wavelength
+        active = mi.Bool(active)
+        seen = mi.Bool(False)
+        last_pdf = mi.Float(1.0)
+        alone = mi.Bool(True)  # light met by chance is not also connected to
+        last = dr.zeros(mi.Interaction3f)
+        first_light = mi.UnpolarizedSpectrum(0.0)
+        first_passed = mi.UnpolarizedSpectrum(1.0)
+
+        while dr.hint(active, label="atmosphere_path"):
+            si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
+            surface = active & si.is_valid() & (air.globe.altitude(si.p) > -DEEPEST_M)
+            part = air.along(ray, dr.select(surface, si.t, dr.inf))
+            shows = active & (surface | (depth > 0) | ~mi.Bool(self.hide_emitters))
+
+            grounded = active & part.ground & ~surface
+            inscatter = self._inscatter(scene, sampler, ray, part, light, air, active)
+            lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
+            disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
+            disc = dr.select(active & ~surface & ~grounded, disc, 0.0)
+            ground = air.on_ground(ray(part.distance), lit)
+            arriving = light.sum(passed, inscatter, part.transmittance, ground, grounded, disc)
+            result += dr.select(shows, reflected * colours.of(arriving, ray.wavelengths), 0.0)
+            seen |= shows
+            passed = products(passed, part.transmittance)
+            if dr.hint(len(self.aovs) > 0, mode="scalar"):
+                start = depth == 0
+                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths), first_light)
+                first_passed = dr.select(start, colours.white(part.transmittance, ray.wavelengths), first_passed)
+
+            # Lamps that the ray meets.
+            white = colours.white(passed, ray.wavelengths)
+            if dr.hint(len(lamps) > 0, mode="scalar"):
+                emitter = si.emitter(scene, active)
+                shines = shows & light.is_lamp(emitter) & (surface | ~si.is_valid())
+                ds = mi.DirectionSample3f(scene, si, last)
+                chance = emitter.pdf_direction(last, ds, shines & ~alone) * (1.0 / len(lamps))
+                share = dr.select(alone, 1.0, mis_weight(last_pdf, chance))
+                emitted = unpolarized(emitter.eval(si, shines))
+                result += dr.select(shines, reflected * white * emitted * share, 0.0)
+
+            # At the surface: the sun and one lamp.
+            active = surface & (depth + 1 < most)
+            bsdf = si.bsdf(ray)
+            smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            toward = light.toward_sun(sampler.next_2d(smooth))
+            facing = smooth & ~scene.ray_test(si.spawn_ray(toward), smooth)
+            wo = si.to_local(toward)
+            value, pdf = bsdf.eval_pdf(context, si, wo, facing)
+            mixed = light.mixed_pdf(pdf, toward)
+            weight = mis_weight(light.sun_density, mixed) * light.sun_scale
+            sunlight = colours.of(products(air.sunlight(si.p, toward), passed), ray.wavelengths)
+            gain = reflected * unpolarized(value) * sunlight * weight
+            result += dr.select(facing, gain, 0.0)
+            if dr.hint(len(lamps) > 0, mode="scalar"):
+                chosen = dr.minimum(mi.UInt32(sampler.next_1d(smooth) * len(lamps)), len(lamps) - 1)
+                lamp = dr.gather(mi.EmitterPtr, lamp_list, chosen, smooth)
+                ds, radiance = lamp.sample_direction(si, sampler.next_2d(smooth), smooth)
+                connects = smooth & (ds.pdf > 0.0) & dr.isfinite(ds.pdf)
+                connects &= ~scene.ray_test(si.spawn_ray_to(ds.p), connects)
+                value, pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), connects)
+                other = dr.select(ds.delta, 0.0, light.mixed_pdf(pdf, ds.d))
+                radiance = unpolarized(radiance) * mis_weight(ds.pdf * (1.0 / len(lamps)), other) * len(lamps)
+                result += dr.select(connects, reflected * white * unpolarized(value) * radiance, 0.0)
+
+            # Go on, to where the BSDF or the sky says.
+            bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(active), sampler.next_2d(active), active)
+            by_sky = smooth & (sampler.next_1d(active) < SKY_SHARE)
+            delta = ~by_sky & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            d = dr.select(by_sky, light.sample_sky(sampler.next_2d(active), by_sky), si.to_world(bs.wo))
+            value, pdf = bsdf.eval_pdf(context, si, si.to_local(d), smooth & ~delta)
+            last_pdf = light.mixed_pdf(pdf, d)
+            chosen_weight = dr.select(
+                delta,
+                unpolarized(bsdf_weight) * dr.select(smooth, 1.0 / (1.0 - SKY_SHARE), 1.0),
+                dr.select(last_pdf > 0.0, unpolarized(value) / last_pdf, 0.0),
+            )
+            # A BSDF without smooth part that drew no delta has drawn nothing.
+            reflected *= chosen_weight
+            alone = delta
+            ray = si.spawn_ray(d)
+            last = mi.Interaction3f(si)
+            depth += 1
+            carried = dr.max(reflected) * dr.max(dr.abs(colours.white(passed, ray.wavelengths)))
+            active &= dr.max(reflected) > 0.0
+            ends = depth >= self.rr_depth
+            survives = dr.minimum(carried, 0.95)
+            active &= ~ends | (sampler.next_1d(active) < survives)
+            reflected *= dr.select(ends, 1.0 / dr.maximum(survives, 1e-12), 1.0)
+
+        aovs = []
+        for name in self.aovs:
+            values = first_light if name == "inscatter" else first_passed
+            aovs += [values[i] for i in range(len(values))]
+        return mi.Spectrum(result), seen, aovs
+
+    def _inscatter(self, scene: Any, sampler: Any, ray: Any, part: Any, light: Skylight, air: Airlight, active: Any):
+        """What the air of a segment scatters, less what shapes keep the sun from."""
+        if not self._shades(scene, air):
+            return part.light
+        toward = light.toward_sun(sampler.next_2d(active))
+        start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
+        missing = air.shade(
+            part,
+            start,
+            end,
+            sampler.next_1d(active),
+            self.shaft_samples,
+            lambda distance: self._lit(scene, ray(distance), toward, active),
+        )
+        return [a - b for a, b in zip(part.light, missing, strict=True)]
+
+    def _shades(self, scene: Any, air: Airlight) -> bool:
+        """Whether the shadows of shapes matter to the air."""
+        box = scene.bbox()
+        across = float(np.linalg.norm(np.array(box.max) - np.array(box.min))) / self.scale if box.valid() else 0.0
+        return self.shaft_samples > 0 and across * air.densest > LEAST_DEPTH
+
+    def _lit(self, scene: Any, p: Any, toward: Any, active: Any) -> Any:
+        """1 where no shape is between a point of the air and the sun, else 0."""
+        return dr.select(scene.ray_test(mi.Ray3f(p, toward), active), 0.0, 1.0)
+
+    def _parts(self, scene: Any) -> tuple[Skylight, Airlight, Colours]:
+        """The light of the scene's emitter, its air and the colours of both, made again where the emitter changed."""
+        emitters = [e for e in scene.emitters() if hasattr(e, "sky_light")]
+        if len(emitters) != 1:
+            raise InputError(f"atmosphere_path: the scene has {len(emitters)} emitters of type atmosphere; must be one")
+        emitter = emitters[0]
+        key = (id(emitter), id(emitter.sky_light), id(emitter.sky))
+        if self._held is None or self._held[0] != key:
+            sky = emitter.sky
+            if self.atmosphere is not None or self.orders is not None:
+                sky = Sky(self.atmosphere or sky.atmosphere, self.orders)
+            center = self.center
+            if center is None:
+                distance = sky.atmosphere.bottom_radius_m + emitter.altitude_m
+                center = -distance * self.scale * emitter.up
+            light = Skylight(emitter, sky.atmosphere, SKY_SHARE)
+            air = Airlight(sky, Globe(sky.atmosphere, center, self.scale), emitter.sun)
+            self._held = key, emitter, (light, air, Colours(sky.atmosphere))
+        self._held[2][0].refresh()
+        return self._held[2]
+
+    def to_string(self) -> str:
+        return f"AtmospherePath[max_depth = {self.max_depth}, shaft_samples = {self.shaft_samples}]"
+
+
+def products(one: list[Any], other: list[Any]) -> list[Any]:
+    """Wavelength by wavelength."""
+    return [a * b for a, b in zip(one, other, strict=True)]

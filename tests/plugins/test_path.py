@@ -1,0 +1,232 @@
+"""The integrator ``atmosphere_path``: against ``path`` where there is hardly air, against path-traced air where there
+is, and against ``atmo_jit.sky`` where there is nothing else."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from ztests import assert_agree, of_passes
+
+import atmo_jit
+from atmo_jit.errors import AtmosphereError, InputError
+from atmo_jit.spectrum import SpectralBasis
+
+mi = pytest.importorskip("mitsuba")
+
+SUN = np.array([0.25, 1.0, 0.5]) / np.linalg.norm([0.25, 1.0, 0.5])
+# One wavelength, so that noise is all that a picture and its twin differ by.
+HAZE = {
+    "wavelengths_nm": [550],
+    "solar_irradiance": [1.0],
+    "bottom_radius_m": 6360000,
+    "top_radius_m": 6420000,
+    "rayleigh": {"scattering_per_m": [1.3558e-5], "scale_height_m": 8000},
+    "mie": {
+        "scattering_per_m": [5e-5],
+        "single_scattering_albedo": [0.9],
+        "scale_height_m": 1200,
+        "phase": {"type": "cornette_shanks", "g": 0.76},
+    },
+    "ozone": None,
+    "ground_albedo": [0.0],
+    "sun_angular_radius_deg": 0.26,
+}
+
+
+def passes(scene, count, spp):
+    """Pictures [count, height, width, channels] with seeds of their own."""
+    return np.stack([np.array(mi.render(scene, spp=spp, seed=i), dtype=np.float64) for i in range(count)])
+
+
+def tiles(pictures, size):
+    """Means over squares of ``size`` pixels."""
+    n, height, width, channels = pictures.shape
+    return pictures.reshape(n, height // size, size, width // size, size, channels).mean(axis=(2, 4))
+
+
+def camera(width, height, origin, target, **options):
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
+    return {"type": "perspective", "fov": 70, "to_world": to_world, "film": film, **options}
+
+
+def things():
+    """Small things on a floor: a glossy ball, a rough one, a lamp and a mirror."""
+    at = mi.ScalarTransform4f()
+    plastic = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.6, 0.3, 0.1]}}
+    rough = {"type": "roughconductor", "alpha": 0.2}
+    return {
+        "floor": {"type": "disk", "to_world": at.scale(100), "bsdf": {"type": "diffuse"}},
+        "ball": {"type": "sphere", "center": [1.5, 8, 2], "radius": 2, "bsdf": plastic},
+        "metal": {"type": "sphere", "center": [-4, 8, 2], "radius": 2, "bsdf": rough},
+        "lamp": {
+            "type": "sphere",
+            "center": [-1, 6, 0.6],
+            "radius": 0.5,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [0.5, 0.3, 0.1]}},
+        },
+    }
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
+    mi.set_variant(variant)
+    found = []
+    for integrator in ("path", "atmosphere_path"):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": integrator, "max_depth": 4},
+                "sky": {"type": "atmosphere", "sun_direction": [0.3, -0.7, 0.4], "altitude": 2.0},
+                "sensor": camera(32, 16, [0, 0, 2], [0, 10, 2]),
+                **things(),
+            }
+        )
+        found.append(of_passes(tiles(passes(scene, 12, 16), 4)))
+    # 10 m of air are not much, but not nothing; and the emitter's table is not exact.
+    for estimate in found:
+        estimate.variance[:] += (0.002 * found[0].mean) ** 2
+    assert_agree(*found)
+
+
+def shaded(integrator, orders=None, **options):
+    """Two black towers, kilometres high, between the camera and the sun, in haze."""
+    at, atmosphere = mi.ScalarTransform4f(), atmo_jit.Atmosphere.load(HAZE)
+    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}
+    towers = {
+        "west": {"type": "cube", "to_world": at.translate([-1200, 6000, 1300]).scale([900, 400, 1500]), "bsdf": black},
+        "east": {"type": "cube", "to_world": at.translate([2000, 5000, 1000]).scale([900, 400, 1200]), "bsdf": black},
+    }
+    sensor = camera(48, 32, [0, 0, 100], [0, 1000, 260], far_clip=1e8)
+    if integrator == "atmosphere_path":
+        sky = {"type": "atmosphere", "atmosphere": json.dumps(HAZE), "sun_direction": SUN.tolist(), "altitude": 0.0}
+        sky["sun_scale"] = 0.0  # the disc itself would only add noise
+        parts = {"integrator": {"type": integrator, "max_depth": 1, "orders": orders, **options}, "sky": sky}
+    else:
+        from atmo_jit.plugins.planet import planet
+
+        parts = planet(atmosphere, sun_direction=SUN, sun_radius_deg=0.26)
+        sensor["medium"] = parts.pop("air")
+        parts["integrator"] = {"type": integrator, "max_depth": orders + 1, "hide_emitters": True}
+    return mi.load_dict({"type": "scene", "sensor": sensor, **parts, **towers})
+
+
+def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
+    mi.set_variant("llvm_ad_mono")
+    own = tiles(passes(shaded("atmosphere_path", 1), 8, 8), 8)
+    truth = tiles(passes(shaded("atmosphere_volpath", 1), 16, 64), 8)
+    without = tiles(passes(shaded("atmosphere_path", 1, shaft_samples=0), 1, 8), 8)[0]
+    estimates = [of_passes(v) for v in (own, truth)]
+    assert_agree(*estimates)
+    # The shadows are there, and what is known of them is known well.
+    assert np.max(without / estimates[1].mean) > 1.5
+    assert np.median(np.sqrt(estimates[1].variance) / estimates[1].mean) < 0.01
+
+
+@pytest.mark.parametrize("altitude", [2.0, 50e3, 400e3])
+def test_without_shapes_the_picture_is_the_sky(rgb, altitude):
+    size, parts = 16, 8
+    sun = np.array([0.9, 0.2, 0.15]) / np.linalg.norm([0.9, 0.2, 0.15])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "atmosphere_path"},
+            "sky": {"type": "atmosphere", "sun_direction": sun.tolist(), "altitude": altitude, "sun_scale": 0.0},
+            "sensor": camera(size, size, [0, 0, 0], [1, 0.1, 0.2 if altitude < 1e3 else -0.6]),
+        }
+    )
+    picture = passes(scene, 8, 32)
+    at = (np.arange(size * parts) + 0.5) / (size * parts)
+    x, y = np.meshgrid(at, at)
+    position = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    d = np.array(ray.d, dtype=np.float64)
+    views = {
+        "altitude_m": altitude,
+        "sun_zenith_deg": np.degrees(np.arccos(sun[2])),
+        "view_zenith_deg": np.degrees(np.arctan2(np.hypot(d[0], d[1]), d[2])),
+        "azimuth_deg": np.degrees(np.arctan2(d[1], d[0]) - np.arctan2(sun[1], sun[0])),
+    }
+    radiance = atmo_jit.sky("earth", views, method="march").radiance
+    expected = SpectralBasis.of("earth").to_srgb(radiance).reshape(size, parts, size, parts, 3).mean(axis=(1, 3))
+    estimate = of_passes(picture)
+    error = np.abs(estimate.mean - expected)
+    # Pixels at an edge depend on where in them the samples fall.
+    assert np.median(error / expected.clip(1e-3)) < 0.003
+    assert np.mean(error <= 4.0 * np.sqrt(estimate.variance) + 0.003 * expected + 1e-4) > 0.98
+    assert np.all(picture >= 0.0)
+
+
+def test_aovs_split_the_picture(rgb):
+    """In front of black shapes there is the air's light and nothing else; its transmittance is that of ``sky``."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "atmosphere_path", "aovs": "inscatter, transmittance", "shaft_samples": 0},
+            "sky": {"type": "atmosphere", "sun_direction": [0.9, 0.2, 0.4], "altitude": 1000.0},
+            "sensor": camera(4, 4, [0, 0, 0], [0, 1, 0], fov=0.2, far_clip=1e8),
+            "wall": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().look_at([0, 2e4, 0], [0, 0, 0], [0, 0, 1]).scale(3e3),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            },
+        }
+    )
+    assert scene.integrator().aov_names() == [f"{n}.{c}" for n in ("inscatter", "transmittance") for c in "RGB"]
+    picture = passes(scene, 1, 16)[0].mean(axis=(0, 1))
+    colour, inscatter, transmittance = picture[-9:-6], picture[-6:-3], picture[-3:]
+    np.testing.assert_allclose(colour, inscatter, rtol=1e-4)
+    views = {"altitude_m": 1000.0, "sun_zenith_deg": 66.5, "view_zenith_deg": 90.0, "azimuth_deg": 0.0}
+    truth = atmo_jit.sky("earth", {**views, "distance_m": 2e4}).transmittance[0]
+    basis = SpectralBasis.of("earth")
+    white = basis.srgb_matrix * basis.solar_irradiance
+    np.testing.assert_allclose(transmittance, white @ truth / white.sum(axis=1), rtol=5e-3)
+
+
+def test_interval_in_shadow_holds_every_shaded_point(rgb):
+    from atmo_jit.plugins.shadow_volume import shadowed_interval
+
+    rng = np.random.default_rng(5)
+    count = 400
+    low, high = np.array([-3.0, 0.0, -2.5]), np.array([1.5, 3.0, 4.0])
+    sun = rng.normal(size=(3, count))
+    sun /= np.linalg.norm(sun, axis=0)
+    sun[:, :20] = np.eye(3)[:, [0, 2] * 10]  # along an axis
+    o, d = rng.uniform(-6, 6, (3, count)), rng.normal(size=(3, count))
+    d /= np.linalg.norm(d, axis=0)
+    box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*low), mi.ScalarPoint3f(*high))
+    start, end = shadowed_interval(box, mi.Vector3f(*sun), mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d)), mi.Float(10.0))
+    start, end = (np.broadcast_to(np.array(v), count) for v in (start, end))
+    t = np.linspace(0.0, 10.0, 501)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = [((b[:, None, None] - o[:, None] - d[:, None] * t) / sun[:, None]) for b in (low, high)]
+    near, far = np.minimum(*sides).max(axis=0), np.maximum(*sides).min(axis=0)
+    meets = far >= np.maximum(near, 0.0)
+    inside = (t >= start - 1e-3) & (t <= end + 1e-3)
+    assert np.all(inside | ~meets)
+    assert meets.any(axis=0).mean() > 0.2
+    # And hardly more than they are.
+    assert np.mean((t > start + 0.05) & (t < end - 0.05) & ~meets) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"max_depth": -2}, "max_depth"),
+        ({"shaft_samples": -1}, "shaft_samples"),
+        ({"scale": 0.0}, "scale"),
+        ({"aovs": "depth"}, "aovs"),
+    ],
+)
+def test_what_is_not_allowed_is_named(rgb, options, text):
+    with pytest.raises((AtmosphereError, RuntimeError), match=text):
+        mi.load_dict({"type": "atmosphere_path", **options})
+
+
+def test_one_emitter_is_needed(rgb):
+    sensor = camera(4, 4, [0, 0, 0], [1, 0, 0])
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "atmosphere_path"}, "sensor": sensor})
+    with pytest.raises((InputError, RuntimeError), match="0 emitters of type atmosphere"):
+        scene.integrator().render(scene, spp=1)

@@ -1,0 +1,249 @@
+"""Derivatives of the sky by everything it depends on: against differences, against Monte Carlo, forward against
+reverse, through Dr.Jit and JAX, and finite wherever geometry is singular."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from tolerances import ADJOINT, DERIVATIVE_BY_COEFFICIENT, DERIVATIVE_BY_G, DIFFERENCES, NODES_MOVED
+
+import atmo_jit
+from atmo_jit.backend import types
+from atmo_jit.derivatives import OUTPUTS, Linearization, differentiable, jacobian
+from atmo_jit.errors import InputError
+from atmo_jit.parameters import RADII, VIEWS, described, parameter_names, per_wavelength
+
+EARTH = atmo_jit.Atmosphere.load("earth").replace({"mie.scattering_per_m": [1.2e-5, 1.4e-5, 1.9e-5]})
+TABULATED = EARTH.replace(
+    {
+        "rayleigh.profile": {"altitude_m": [0, 4e3, 1e4, 3e4, 6e4], "density": [1.0, 0.6, 0.28, 0.02, 0.001]},
+        "mie.phase.g": [0.5, 0.6, -0.2],
+        "ground_albedo": 0.4,
+    }
+)
+COARSE = 0.03
+VIEWPOINTS = {
+    "altitude_m": np.array([0.0, 10.0, 3e3, 2e4, 3e5, 0.0]),
+    "sun_zenith_deg": np.array([20.0, 62.0, 45.0, 80.0, 40.0, 92.0]),
+    "view_zenith_deg": np.array([30.0, 80.0, 120.0, 60.0, 170.0, 75.0]),
+    "azimuth_deg": np.array([0.0, 70.0, 140.0, 20.0, 90.0, 10.0]),
+}
+
+
+@pytest.fixture(scope="module")
+def at():
+    return Linearization(EARTH, VIEWPOINTS, tolerance=COARSE)
+
+
+def differences(at, name, step):
+    """Central differences of the radiance by the logarithm of a common factor, or by degrees or metres of a view."""
+    ends = []
+    for sign in (1, -1):
+        air, views = at.atmosphere, dict(at.views)
+        if name in VIEWS:
+            views[name] = views[name] + sign * step
+        else:
+            air = air.replace({name: (np.asarray(described(air, name)) * (1.0 + sign * step)).tolist()})
+        end = Linearization(air, views, tolerance=COARSE, resolution=at.sky.resolution)
+        ends.append(end.value["radiance"].astype(float))
+    return (ends[0] - ends[1]) / (2.0 * step)
+
+
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        ("mie.scattering_per_m", 0.02),
+        ("rayleigh.scattering_per_m", 0.02),
+        ("mie.single_scattering_albedo", 0.02),
+        ("mie.phase.g", 0.01),
+        ("ozone.absorption_per_m", 0.2),
+        ("ground_albedo", 0.1),
+        ("solar_irradiance", 0.1),
+        ("azimuth_deg", 0.05),
+        ("sun_zenith_deg", 0.02),
+        ("view_zenith_deg", 0.1),
+    ],
+)
+def test_derivatives_are_those_of_differences(at, name, step):
+    exact = at.jacobian([name])[name] * (1.0 if name in VIEWS else described(at.atmosphere, name))
+    want = differences(at, name, step)
+    scale = np.abs(want).max(axis=0)
+    assert np.abs(exact - want).max() < DIFFERENCES * scale.max()
+    assert np.abs(exact / scale).max() > 0.9
+
+
+def test_derivatives_by_profiles_are_those_of_differences(at):
+    """A profile moves every node of a solve, whose error of some 1e-3 moves too."""
+    for name in ("rayleigh.scale_height_m", "mie.scale_height_m", "ozone.half_width_m"):
+        exact = at.jacobian([name])[name] * described(at.atmosphere, name)
+        want = differences(at, name, 0.05)
+        assert np.abs(exact - want).max() < NODES_MOVED * np.abs(want).max(), name
+
+
+def test_derivatives_by_radii(at):
+    """A planet of another size has air of the same thickness, by both together."""
+    both = sum(at.jacobian(RADII).values())
+    step = 0.02 * EARTH.bottom_radius_m
+    ends = [
+        Linearization(
+            EARTH.replace({n: getattr(EARTH, n) + sign * step for n in RADII}),
+            VIEWPOINTS,
+            tolerance=COARSE,
+            resolution=at.sky.resolution,
+        ).value["radiance"]
+        for sign in (1, -1)
+    ]
+    want = (ends[0] - ends[1]) / (2.0 * step)
+    assert np.abs(both - want).max() < NODES_MOVED * np.abs(want).max()
+
+
+@pytest.mark.parametrize(
+    "air", [EARTH, pytest.param(TABULATED, marks=pytest.mark.slow)], ids=["exponential", "tabulated"]
+)
+def test_forward_and_reverse_are_adjoint(air):
+    """<J v, w> = <v, J' w> for random changes v of all parameters and random weights w of all outputs."""
+    rng = np.random.default_rng(3)
+    at = Linearization(air, VIEWPOINTS, tolerance=COARSE)
+    names = [name for name in parameter_names(air, VIEWPOINTS) if name not in RADII]
+    values = {n: np.asarray(at.views[n] if n in VIEWS else described(air, n)) for n in names}
+    change = {n: rng.normal(size=np.shape(v)) * 0.01 * np.abs(v) for n, v in values.items()}
+    weights = {output: rng.normal(size=at.value[output].shape) for output in OUTPUTS}
+    moved, pulled = at.jvp(change), at.vjp(weights, names)
+    forward = sum(np.vdot(weights[output], moved[output]) for output in OUTPUTS)
+    reverse = sum(np.vdot(change[name], pulled[name]) for name in names)
+    sizes = sum(np.abs(weights[output] * moved[output]).sum() for output in OUTPUTS)
+    assert abs(forward - reverse) < ADJOINT * sizes
+    assert abs(forward) > 0.01 * sizes
+    for name in names:
+        assert np.shape(pulled[name]) == np.shape(values[name])
+
+
+@pytest.mark.slow
+def test_a_jacobian_has_a_column_for_every_node_and_one_for_a_list():
+    at = Linearization(TABULATED, VIEWPOINTS, tolerance=COARSE)
+    radiance, by = jacobian(TABULATED, VIEWPOINTS, ["rayleigh.profile.density", "mie.phase.g"], tolerance=COARSE)
+    assert by["rayleigh.profile.density"].shape == (6, 3, 5)
+    assert radiance == pytest.approx(at.value["radiance"])
+    # Each wavelength has its own g, which no other wavelength knows, apart from where along a ray the field is asked.
+    weights = np.zeros((6, 3))
+    weights[:, 1] = 1.0
+    want = by["mie.phase.g"][:, 1].sum()
+    pulled = at.vjp({"radiance": weights}, ["mie.phase.g"])["mie.phase.g"]
+    assert pulled == pytest.approx([0.0, want, 0.0], rel=0.01, abs=0.01 * abs(want))
+    assert per_wavelength(TABULATED, "mie.phase.g") and not per_wavelength(TABULATED, "ground_albedo")
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_monte_carlo(reference):
+    """sky_derivatives.npz: by the aerosol's scattering, its g, and the albedo of the ground."""
+    d = np.load(reference / "sky_derivatives.npz")
+    worst = dict.fromkeys(("mie.scattering_per_m", "mie.phase.g", "ground_albedo"), 0.0)
+    for case in np.unique(d["case"]):
+        i = np.flatnonzero(d["case"] == case)
+        one = {name: d[name][i[0]] for name in d.files if d[name].shape == d["case"].shape}
+        air = {
+            "wavelengths_nm": [550.0],
+            "bottom_radius_m": one["R_g"],
+            "top_radius_m": one["R_t"],
+            "rayleigh": {"scattering_per_m": one["beta_R"], "scale_height_m": one["H_R"]},
+            "mie": {
+                "scattering_per_m": one["beta_M_sca"],
+                "single_scattering_albedo": one["ssa_M"],
+                "scale_height_m": one["H_M"],
+                "phase": {"type": ("cornette_shanks", "henyey_greenstein")[one["phase_kind"]], "g": one["g"]},
+            },
+            "ozone": {"absorption_per_m": one["beta_O3"], "center_m": 25000, "half_width_m": 15000},
+            "ground_albedo": one["albedo"],
+            "sun_angular_radius_deg": 0,
+        }
+        names = ("obs_height", "sun_zenith_deg", "view_zenith_deg", "rel_azimuth_deg")
+        views = dict(zip(VIEWS, (d[name][i].astype(float) for name in names), strict=False))
+        _, by = jacobian(air, views, list(worst))
+        for name, key, value in zip(
+            worst, ("dL_dbetaM", "dL_dg", "dL_dalbedo"), ("beta_M_sca", "g", "albedo"), strict=True
+        ):
+            error = np.abs(by[name][:, 0] - d[key][i]) - 0.01 * np.abs(d[key][i]) - 3.0 * d[key + "_sigma"][i]
+            worst[name] = max(worst[name], float(np.max(error * d[value][i] / d["L"][i])))
+    assert worst["mie.scattering_per_m"] < DERIVATIVE_BY_COEFFICIENT
+    assert worst["ground_albedo"] < DERIVATIVE_BY_COEFFICIENT
+    assert worst["mie.phase.g"] < DERIVATIVE_BY_G
+
+
+def test_derivatives_are_finite_where_geometry_is_singular():
+    """Zenith, nadir, horizon, ground, top of the air, the sun overhead and underfoot; g = 0 and no aerosol at all."""
+    views = {
+        "altitude_m": [0, 0, 0, 0, 0, 6e4, 6e4, 2e5],
+        "sun_zenith_deg": [60, 0, 0, 180, 90, 60, 0, 30],
+        "view_zenith_deg": [0, 0, 90, 0, 90, 90, 180, 180],
+        "azimuth_deg": [0, 0, 0, 0, 0, 0, 180, 0],
+        "distance_m": [np.inf, np.inf, 1e3, 0.0, np.inf, np.inf, 2e4, np.inf],
+    }
+    air = EARTH.replace({"mie.scattering_per_m": 0.0, "mie.phase.g": 0.0, "ground_albedo": 0.0})
+    at = Linearization(air, views, tolerance=COARSE)
+    names = [name for name in parameter_names(air) if name not in RADII]
+    for name, values in at.jacobian(names).items():
+        assert np.isfinite(values).all(), name
+    for name, values in at.vjp(dict.fromkeys(OUTPUTS, 1.0), names).items():
+        assert np.isfinite(values).all(), name
+    # Aerosol that is not there yet: its first drops brighten the sky.
+    assert np.all(at.jacobian(["mie.scattering_per_m"])["mie.scattering_per_m"][0] > 0.0)
+
+
+def test_a_fit_moves_smoothly(at):
+    """As long as nodes suit they stay, and the radiance changes as its derivative says; else they are placed anew."""
+    step = at.moved({"mie.scattering_per_m": EARTH.get("mie.scattering_per_m") * 1.3, "mie.phase.g": 0.78})
+    assert step.sky.grid is at.sky.grid
+    far = at.moved({"mie.scattering_per_m": EARTH.get("mie.scattering_per_m") * 10.0})
+    assert far.sky.grid is not at.sky.grid
+    assert far.sky.grid is not at.moved({"rayleigh.scale_height_m": 7000.0}).sky.grid
+    want = Linearization(step.atmosphere, VIEWPOINTS, tolerance=COARSE).value["radiance"]
+    assert step.value["radiance"] == pytest.approx(want, rel=0.02)
+
+
+def test_an_unknown_name_is_refused(at):
+    for ask in (lambda: at.jacobian(["mie.foo"]), lambda: at.vjp({}, ["mie.foo"]), lambda: at.jvp({"mie.foo": 1.0})):
+        with pytest.raises(InputError, match=r"gradient: 'mie.foo' is no parameter; allowed are solar_irradiance, "):
+            ask()
+    with pytest.raises(InputError, match="cotangents: 'light' is no output; allowed are radiance, transmittance"):
+        at.vjp({"light": 1.0}, ["mie.phase.g"])
+
+
+def test_sky_names_derivatives_by_kind():
+    found = atmo_jit.sky(EARTH, VIEWPOINTS, tolerance=COARSE, gradient=["mie.phase.g", "mie.scattering_per_m"])
+    assert set(found.gradient) == {"d_radiance/mie.phase.g", "dlog_radiance/mie.scattering_per_m"}
+    by = Linearization(EARTH, VIEWPOINTS, tolerance=COARSE).jacobian(["mie.scattering_per_m"])
+    want = by["mie.scattering_per_m"] * EARTH.get("mie.scattering_per_m")
+    assert found.gradient["dlog_radiance/mie.scattering_per_m"] == pytest.approx(want, rel=1e-4)
+
+
+def test_dr_jit_derivatives_pass_through(at):
+    """Of a loss of radiances, backwards to leaves of other shapes than the description's, and forwards from one."""
+    t = types()
+    g, scattering, sun = t.Float(0.8), t.Float(EARTH.get("mie.scattering_per_m").tolist()), t.Float(62.0)
+    views = {name: values[1:2] for name, values in VIEWPOINTS.items()}
+    leaves = {"mie.phase.g": g, "mie.scattering_per_m": scattering, "sun_zenith_deg": sun}
+    dr.enable_grad(list(leaves.values()))
+    light = differentiable(EARTH, views, leaves, tolerance=COARSE)["radiance"]
+    dr.backward(dr.sum(light[0] * light[0]) + dr.sum(light[2]))
+    by = at.jacobian(list(leaves))
+    weight = np.array([2.0 * at.value["radiance"][1, 0], 0.0, 1.0])
+    assert dr.grad(g)[0] == pytest.approx(weight @ by["mie.phase.g"][1], rel=1e-3)
+    assert dr.grad(sun)[0] == pytest.approx(weight @ by["sun_zenith_deg"][1], rel=1e-3)
+    assert dr.grad(scattering).numpy().sum() == pytest.approx(weight @ by["mie.scattering_per_m"][1], rel=1e-3)
+    light = differentiable(EARTH, views, leaves, tolerance=COARSE)["radiance"]
+    dr.forward(g)
+    assert [dr.grad(v)[0] for v in light] == pytest.approx(by["mie.phase.g"][1], rel=1e-3)
+
+
+def test_jax_differentiates_the_radiance(at):
+    jax = pytest.importorskip("jax")
+    from atmo_jit.jax_bridge import radiance_function
+
+    radiance = radiance_function(EARTH, VIEWPOINTS, tolerance=COARSE)
+    point = {"mie.phase.g": jax.numpy.float32(0.8), "ground_albedo": jax.numpy.float32(0.1)}
+    value, slope = jax.jit(jax.value_and_grad(lambda p: radiance(p)[:3].sum()))(point)
+    by = at.jacobian(list(point))
+    assert float(value) == pytest.approx(at.value["radiance"][:3].sum(), rel=1e-5)
+    for name in point:
+        assert float(slope[name]) == pytest.approx(by[name][:3].sum(), rel=1e-3)
