@@ -2,6 +2,7 @@
 
     python -m bench.colour            # the errors of what the package has
     python -m bench.colour --fit      # choose wavelengths, fit matrices, and print both for atmo_jit/spectrum.py
+    python -m bench.colour --presets  # those of presets that were made for three wavelengths
     python -m bench.colour --twilight # chromaticities with and without ozone
 
 Skies are those of random Earths (:func:`atmo_jit.earth.earth_at`: six types of aerosol, optical depths by a factor of
@@ -20,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from atmo_jit import Sky
+from atmo_jit import Atmosphere, Sky
 from atmo_jit.backend import doubles
 from atmo_jit.earth import AEROSOLS, earth_at
 from atmo_jit.spectrum import FITTED, SpectralBasis, solar_irradiance
+from atmo_jit.wavelengths import at_wavelengths
 
 from .page import table
 from .spectra import colour_science
@@ -179,6 +181,29 @@ def package_ways() -> dict[str, tuple[Sequence[float], np.ndarray]]:
     return ways
 
 
+def preset_rows(names: Sequence[str]) -> list[dict[str, Any]]:
+    """Delta E of presets seen from the ground, at their own wavelengths and described at the fitted ones, against
+    the same at 40 wavelengths."""
+    rng = np.random.default_rng(HELD_OUT)
+    sun = np.radians(np.concatenate([rng.uniform(0.0, 85.0, VIEWS), rng.uniform(80.0, 96.0, VIEWS)]))
+    view, azimuth = np.arccos(rng.uniform(0.0, 1.0, 2 * VIEWS)), rng.uniform(0.0, np.pi, 2 * VIEWS)
+
+    def xyz(air: Atmosphere) -> np.ndarray:
+        light = Sky(air).rays(0.0 * sun, sun, view, azimuth).radiance
+        return np.stack([v.numpy() for v in light], axis=-1).astype(float) @ SpectralBasis.of(air).xyz_matrix.T
+
+    found = []
+    for name in names:
+        air = Atmosphere.load(name)
+        truth = xyz(at_wavelengths(air, GRID_NM))
+        for nm in (air.wavelengths_nm, *FITTED):
+            e = difference(xyz(at_wavelengths(air, nm)), truth)
+            figures = {"median": np.median(e), "p95": np.percentile(e, 95), "max": e.max()}
+            way = " / ".join(f"{v:g}" for v in nm) + " nm"
+            found.append({"way": way, "light": name, "colours": len(e)} | {k: float(v) for k, v in figures.items()})
+    return found
+
+
 def report(found: list[dict[str, Any]]) -> str:
     """The table of :func:`rows`."""
     heads = {"way": "wavelengths", "light": "light", "colours": "colours"}
@@ -204,11 +229,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--fit", action="store_true", help="choose wavelengths, fit matrices and print them")
     parser.add_argument("--twilight", action="store_true", help="print chromaticities with and without ozone")
+    parser.add_argument("--presets", action="store_true", help="print the errors of presets with three wavelengths")
     parser.add_argument("--atmospheres", type=int, default=24, help="of each set (24)")
     options = parser.parse_args()
     if options.twilight:
         found = chromaticities()
         print(table(found, {name: name for name in found[0]}))
+        return
+    if options.presets:
+        print(report(preset_rows(("earth", "bruneton2008", "hillaire2020", "mars"))))
         return
     held_out = skies(HELD_OUT, options.atmospheres, VIEWS)
     if not options.fit:
