@@ -32,6 +32,7 @@ _MODULE_OF = {
     "RayLight": "sky",
     "Sky": "sky",
     "SkyResult": "sky",
+    "earth_at": "earth",
     "differentiable": "derivatives",
     "jacobian": "derivatives",
     "linearize": "derivatives",

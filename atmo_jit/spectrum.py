@@ -19,9 +19,12 @@ divides by ``MI_CIE_Y_NORMALIZATION``: Y is a mean radiance in W m^-2 sr^-1 nm^-
 has Y = 1 and the linear sRGB value (1.2048, 0.9483, 0.9091) that Mitsuba's spectral film gives it; no white balance is
 applied.
 
-How good three wavelengths are (680, 550, 440 nm; tests/plugins/test_spectrum.py): skylight of up to 2 air masses is
-right within 5 % of its brightest channel, the sun's red is 2 % too bright at 1 air mass and 27 % at 10, because
-transmittance is convex in between and the ozone band at 600 nm is missed. Ten wavelengths are right within 2 %.
+For the wavelengths of :data:`FITTED` XYZ are not integrals of that spectrum, but a matrix fitted to many skies: the
+fast path, whose colour is next to that of 40 wavelengths (docs/colour.md). Spectra in between stay as above.
+
+How good three wavelengths are otherwise (680, 550, 440 nm; tests/plugins/test_spectrum.py): skylight of up to 2 air
+masses is right within 5 % of its brightest channel, the sun's red is 2 % too bright at 1 air mass and 27 % at 10,
+because transmittance is convex in between and the ozone band at 600 nm is missed. Ten wavelengths are right within 2 %.
 
 Colour matching functions, the solar spectrum and the sRGB matrix are colour-science's, held in a file of their own:
 importing that package takes longer than a picture.
@@ -38,7 +41,16 @@ import numpy as np
 
 from .errors import InputError
 
-__all__ = ["SpectralBasis", "cie_1931", "interpolation_weights", "solar_irradiance", "xyz_to_rgb", "xyz_to_srgb"]
+__all__ = [
+    "FAST_NM",
+    "FITTED",
+    "SpectralBasis",
+    "cie_1931",
+    "interpolation_weights",
+    "solar_irradiance",
+    "xyz_to_rgb",
+    "xyz_to_srgb",
+]
 
 VISIBLE_NM = (360.0, 830.0)  # Mitsuba's range of wavelengths, and that of the colour matching functions
 SMOOTHING_NM = 10  # below this the Fraunhofer lines would make single wavelengths bad anchors of the spectrum
@@ -51,6 +63,23 @@ def _data() -> dict[str, np.ndarray]:
     """Tables of colour-science: see bench/spectra.py."""
     with np.load(DATA, allow_pickle=False) as held:
         return {name: held[name] for name in held.files}
+
+
+# XYZ (normalised as below) of light under the Earth's sun, from its radiance over the sun's irradiance at a few
+# wavelengths (ascending), for skies of the Earth: least squares in CIE Delta E 2000, by `python -m bench.colour --fit`.
+FITTED = {
+    (460.0, 530.0, 620.0): (
+        (0.23898, 0.58073, 0.91417),
+        (-0.03558, 1.32858, 0.49378),
+        (2.06824, -0.32307, 0.10476),
+    ),
+    (440.0, 530.0, 560.0, 640.0): (
+        (0.28685, -0.23039, 1.1971, 0.50569),
+        (0.07094, 0.59711, 0.88151, 0.26015),
+        (1.42744, 1.10803, -0.73594, 0.06868),
+    ),
+}
+FAST_NM = {len(nm): nm for nm in FITTED}  # by their number
 
 
 @cache
@@ -191,8 +220,21 @@ class SpectralBasis:
         return self.sun(at_nm)[:, None] * interpolation_weights(self.wavelengths_nm, at_nm) * inverse
 
     @property
+    def fitted(self) -> np.ndarray | None:
+        """The matrix [3, W] of :data:`FITTED` in the order of these wavelengths; None where there is none, or no
+        sunlight of known shape."""
+        given = tuple(np.sort(self.wavelengths_nm).tolist())
+        if given not in FITTED or np.ptp(self.solar_irradiance) == 0.0:
+            return None
+        return np.array(FITTED[given])[:, np.searchsorted(given, self.wavelengths_nm)]
+
+    @property
     def xyz_matrix(self) -> np.ndarray:
         """[3, W]: CIE XYZ of a radiance, normalised as in Mitsuba (row 1, Y, is what a mono variant shows)."""
+        if self.fitted is not None:
+            own = self.solar_irradiance
+            brightness = np.mean(own / solar_irradiance(self.wavelengths_nm))
+            return brightness * self.fitted * np.divide(1.0, own, out=np.zeros_like(own), where=own > 0.0)
         nm, functions = cie_1931()
         return functions.T @ self.matrix(nm) / functions[:, 1].sum()
 

@@ -21,7 +21,7 @@ def main() -> None:
 def tables() -> dict[str, np.ndarray]:
     """CIE 1931 2 degree colour matching functions (nm [471], xyz [471, 3]), the matrix from XYZ to linear sRGB (IEC
     61966-2-1), and ASTM G173-03 extraterrestrial irradiance (nm and W m^-2 nm^-1 [N, 2])."""
-    colour = _colour()
+    colour = colour_science()
     functions = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
 
@@ -33,7 +33,7 @@ def tables() -> dict[str, np.ndarray]:
     }
 
 
-def _colour() -> Any:
+def colour_science() -> Any:
     """The package colour-science.
 
     Where matplotlib is not installed it says so in a warning and puts mocks of it into ``sys.modules``, which would

@@ -152,6 +152,18 @@ def test_info_prints_a_preset_that_can_be_loaded(name, capsys, tmp_path):
     assert atmo_jit.Atmosphere.load(path) == atmo_jit.Atmosphere.load(name)
 
 
+def test_info_describes_a_preset_at_other_wavelengths(capsys):
+    assert cli.main(["info", "--preset", "earth", "--wavelengths", "440,500,550"]) == 0
+    air = atmo_jit.Atmosphere(json.loads(capsys.readouterr().out))
+    assert air.wavelengths_nm.tolist() == [440.0, 500.0, 550.0]
+    # Its own values where it has them, the cross section's shape in between.
+    assert air.rayleigh.scattering_per_m[[0, 2]] == pytest.approx([3.31e-5, 1.3558e-5])
+    assert air.rayleigh.scattering_per_m[1] == pytest.approx(1.3558e-5 * (550 / 500) ** 4.05, rel=0.01)
+    assert cli.main(["info", "--preset", "earth", "--wavelengths", "440;500"]) == 2
+    assert "--wavelengths: found '440;500'; allowed: fast, or numbers > 0 (nm)" in capsys.readouterr().err
+    assert cli.main(["info", "--wavelengths", "fast"]) == 2
+
+
 def test_info_refuses_an_unknown_preset(capsys):
     assert cli.main(["info", "--preset", "venus"]) == 2
     assert capsys.readouterr().err == (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import sys
 from dataclasses import asdict
@@ -19,16 +20,35 @@ PACKAGES = ("numpy", "scipy", "drjit", "mitsuba", "OpenEXR", "colour-science", "
 
 @click.command()
 @click.option("--preset", metavar="NAME", help=f"Print the JSON of an atmosphere: {', '.join(presets.NAMES)}.")
+@click.option("--wavelengths", metavar="NM,...|fast", help="With --preset: described at these instead; fast: the four "
+              "whose colour is nearest to that of the whole spectrum.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print everything as one JSON object.")
-def command(preset: str | None, as_json: bool) -> None:
+def command(preset: str | None, wavelengths: str | None, as_json: bool) -> None:
     """Versions, which LLVM library was found and whether it is usable, and the atmospheres that come along."""
     if preset is not None:
         if preset not in presets.NAMES:
             raise InputError(f"--preset: found {shown(preset)}; allowed: {', '.join(presets.NAMES)}")
-        click.echo(presets.text(preset), nl=False)
+        click.echo(presets.text(preset) if wavelengths is None else _at_wavelengths(preset, wavelengths), nl=False)
         return
+    if wavelengths is not None:
+        raise InputError("--wavelengths: needs --preset NAME, the atmosphere to describe at them")
     found = collect()
     click.echo(json.dumps(found, indent=2) if as_json else _as_text(found))
+
+
+def _at_wavelengths(preset: str, text: str) -> str:
+    """The JSON of a preset described at other wavelengths."""
+    from atmo_jit.atmosphere import Atmosphere
+    from atmo_jit.spectrum import FAST_NM
+    from atmo_jit.wavelengths import at_wavelengths
+
+    try:
+        nm = FAST_NM[4] if text == "fast" else [float(part) for part in text.split(",")]
+    except ValueError:
+        nm = []
+    if not nm or not all(0.0 < v < math.inf for v in nm):
+        raise InputError(f"--wavelengths: found {shown(text)}; allowed: fast, or numbers > 0 (nm) with commas between")
+    return json.dumps(at_wavelengths(Atmosphere.load(preset), nm).to_dict(), indent=2) + "\n"
 
 
 def collect() -> dict[str, Any]:
