@@ -234,7 +234,12 @@ def test_what_the_tables_cannot_show_is_refused(tmp_path, capsys):
 
 
 def test_an_interrupt_ends_it_without_a_word():
-    command = [sys.executable, "-m", "atmo_jit", "view", "--no-browser"]
+    # Jobs that a shell starts in the background ignore interrupts, and so would all processes below them.
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from atmo_jit.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", code, "view", "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline().startswith("http://127.0.0.1:")
         process.send_signal(signal.SIGINT)
