@@ -1,12 +1,12 @@
 """The shipped scenes: pictures, times, and the same scenes with path-traced air beside them.
 
-    python -m bench.gallery --page docs/gallery.md --pictures docs/images/gallery      # an hour on 2 cores
-    python -m bench.gallery --scenes shafts city --spp 64                              # a look at some
+    python -m bench.gallery --page docs/gallery.md --pictures docs/images/gallery      # 20 minutes on 2 cores
+    python -m bench.gallery --scenes shafts city --spp 256 --times                     # some, and what they take
 
-Each scene is rendered once by ``atmo-jit render`` as a user does (640 x 360, kernels of this machine's cache or none),
-which gives the time; and, smaller, in independent passes by its own integrator and with path-traced air
+Each scene is rendered in independent passes by its own integrator and with path-traced air
 (``atmo_jit.plugins.reference``), which gives both pictures' noise. Differences are of means over squares of pixels.
 The gain is the ratio of 1 / (relative variance x CPU seconds) of the two, over the pixels that neither has black.
+``--times`` adds the wall seconds of ``atmo-jit render NAME`` at its own size, with an empty cache of kernels and again.
 """
 
 from __future__ import annotations
@@ -29,12 +29,11 @@ SQUARE = 20
 PASSES = 4
 TEXT = """# Gallery
 
-Printed by `python -m bench.gallery --page docs/gallery.md --pictures docs/images/gallery`. Left the scene's own
-integrator with the solved atmosphere, right the same scene with path-traced air (`atmo-jit render NAME --reference`)
-at {spp} samples per pixel. "seconds" is the wall time of the command at 640 x 360, with an empty cache of kernels and
-again. Differences are of the means over squares of {square} x {square} pixels, in per cent of the green channel;
-"beyond 3 sigma" is the 95th percentile of what they exceed three standard errors by. "gain" is how many times less
-processor time the left picture takes for the same noise.
+Printed by `python -m bench.gallery {arguments}--page docs/gallery.md --pictures docs/images/gallery`.
+Left the scene's own integrator with the solved atmosphere, right the same scene with path-traced air
+(`atmo-jit render NAME --reference`) at {spp} samples per pixel. Differences are of the means over squares of
+{square} x {square} pixels, in per cent of the green channel; "beyond 3 sigma" is the 95th percentile of what they exceed
+three standard errors by. "gain" is how many times less processor time the left picture takes for the same noise.
 
 """
 
@@ -115,18 +114,18 @@ def measure(name: str, spp: int, time_command: bool, show: Callable[[str, np.nda
     return row
 
 
-def page(rows: Sequence[Mapping[str, Any]], spp: int, folder: str) -> str:
+def page(rows: Sequence[Mapping[str, Any]], spp: int, folder: str, arguments: str) -> str:
     from atmo_jit import scenes
 
     columns = {
         "scene": "scene",
-        "seconds": "seconds",
+        **({"seconds": "seconds, first and again"} if "seconds" in rows[0] else {}),
         "median": "median %",
         "p95": "p95 %",
         "beyond": "p95 beyond 3 sigma %",
         "gain": "gain",
     }
-    text = TEXT.format(spp=spp, square=SQUARE) + table(rows, columns)
+    text = TEXT.format(spp=spp, square=SQUARE, arguments=arguments) + table(rows, columns)
     for row in rows:
         name = row["scene"]
         purpose, command = scenes.purpose(scenes.find(name)), f"`atmo-jit render {name} --out {name}.exr`"
@@ -138,8 +137,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from atmo_jit import scenes
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=list(scenes.shipped()), metavar="NAME")
-    parser.add_argument("--spp", type=int, default=256, help="samples per pixel of the path-traced twin")
+    parser.add_argument("--scenes", nargs="*", metavar="NAME")
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel of the path-traced twin")
+    parser.add_argument("--times", action="store_true")
     parser.add_argument("--page", type=Path)
     parser.add_argument("--pictures", type=Path, metavar="FOLDER")
     given = parser.parse_args(arguments)
@@ -159,13 +159,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             mi.util.write_bitmap(str(given.pictures / f"{name}.png"), display(picture).astype(np.float32))
 
     rows = []
-    for name in given.scenes:
-        rows.append(measure(name, given.spp, given.page is not None, show))
+    for name in given.scenes or scenes.shipped():
+        rows.append(measure(name, given.spp, given.times, show))
         print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else str(v) for k, v in rows[-1].items()), flush=True)
     if given.page:
         relative = Path(given.pictures or "images/gallery")
         folder = relative.relative_to(given.page.parent) if relative.is_relative_to(given.page.parent) else relative
-        given.page.write_text(page(rows, given.spp, str(folder)), encoding="utf-8")
+        named = f"--scenes {' '.join(given.scenes)} " if given.scenes else ""
+        given.page.write_text(page(rows, given.spp, str(folder), named), encoding="utf-8")
     return 0
 
 
