@@ -32,8 +32,8 @@ TEXT = """# Gallery
 Printed by `python -m bench.gallery {arguments}--page docs/gallery.md --pictures docs/images/gallery`.
 Left the scene's own integrator with the solved atmosphere, right the same scene with path-traced air
 (`atmo-jit render NAME --reference`) at {spp} samples per pixel. Differences are of the means over squares of
-{square} x {square} pixels, in per cent of the green channel; "beyond 3 sigma" is the 95th percentile of what they exceed
-three standard errors by. "gain" is how many times less processor time the left picture takes for the same noise.
+{square} x {square} pixels, in per cent of the green channel; "beyond 3 sigma" is the 95th percentile of what they
+exceed three standard errors by. "gain" is how many times less processor time the left picture takes for the same noise.
 
 """
 
