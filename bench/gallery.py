@@ -61,8 +61,9 @@ def compare(own: np.ndarray, truth: np.ndarray, own_seconds: float, truth_second
     mean, reference = a.mean(axis=0), b.mean(axis=0)
     sigma = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / len(a))
     known = (reference > 1e-3 * reference.max()) & (sigma < 0.2 * reference)
-    difference = 100.0 * np.abs(mean / np.where(known, reference, 1.0) - 1.0)[known]
-    beyond = np.maximum(difference - 300.0 * (sigma / reference)[known], 0.0)
+    mean, reference, sigma = mean[known], reference[known], sigma[known]
+    difference = 100.0 * np.abs(mean / reference - 1.0)
+    beyond = np.maximum(difference - 300.0 * sigma / reference, 0.0)
 
     def efficiency(pictures: np.ndarray, seconds: float) -> float:
         green = pictures[..., 1]
