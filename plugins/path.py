@@ -83,7 +83,7 @@ class AtmospherePath:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
     points, more where it scatters more. Scenes too small for that to matter skip it. With the sun goes the light that
     has been scattered forward, from about the sun; other light of higher orders is that of the planet without shapes,
-    so the air in a shadow is brighter than it should be (docs/accuracy.md says by how much).
+    so the air in a shadow is brighter than it should be (docs/gallery.md says by how much).
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.
