@@ -128,7 +128,7 @@ def test_a_jacobian_has_a_column_for_every_node_and_one_for_a_list():
     # Each wavelength has its own g, which no other wavelength knows, apart from where along a ray the field is asked.
     weights = np.zeros((6, 3))
     weights[:, 1] = 1.0
-    want = by["mie.phase.g"][:, 1].sum()
+    want = float(by["mie.phase.g"][:, 1].sum())
     pulled = at.vjp({"radiance": weights}, ["mie.phase.g"])["mie.phase.g"]
     assert pulled == pytest.approx([0.0, want, 0.0], rel=0.01, abs=0.01 * abs(want))
     assert per_wavelength(TABULATED, "mie.phase.g") and not per_wavelength(TABULATED, "ground_albedo")
