@@ -67,7 +67,7 @@ def command(
     """
     if list_scenes:
         for name, path in scenes.shipped().items():
-            click.echo(f"{name:<10} {scenes.purpose(path)}")
+            click.echo(f"{name:<{max(map(len, scenes.shipped()))}} {scenes.purpose(path)}")
         return
     if scene is None:
         raise InputError("SCENE is missing; give a file or one of the shipped scenes: " + ", ".join(scenes.shipped()))
