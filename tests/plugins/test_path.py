@@ -70,7 +70,7 @@ def things():
     }
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", pytest.param("llvm_ad_spectral", marks=pytest.mark.slow)])
 def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
     mi.set_variant(variant)
     found = []
