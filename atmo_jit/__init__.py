@@ -33,7 +33,7 @@ _MODULE_OF = {
     "Sky": "sky",
     "SkyResult": "sky",
     "earth_at": "earth",
-    "differentiable": "derivatives",
+    "differentiable": "operation",
     "jacobian": "derivatives",
     "linearize": "derivatives",
 }

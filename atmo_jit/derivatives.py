@@ -10,25 +10,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere
-from .backend import doubles, evaluated, floats, traversing, types
+from .backend import doubles, floats
 from .errors import InputError
+from .evaluation import OUTPUTS, Evaluation, TableEvaluation, where
 from .grid import Grid
 from .optics import Optics, on_device
-from .parameters import RADII, VIEWS, check_names, described, directions, flat, like, per_wavelength, tangent
+from .parameters import (
+    RADII,
+    VIEWS,
+    check_names,
+    described,
+    directions,
+    flat,
+    like,
+    per_wavelength,
+    replaced,
+    tangent,
+)
 from .pieces import Pieces
-from .recording import Recordings, copied
 from .resolution import Resolution
 from .sky import Sky
 from .views import check_views
 
-OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
 GEOMETRY = ("radius", "thickness")  # of Optics.values, and
 SHAPE = ("profiles", "sun_radius")  # with these, nothing that is kept with a grid serves
 PROFILE = ("scale_height_m", "center_m", "half_width_m")
@@ -241,9 +251,9 @@ class Linearization:
 
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:
-        """What _Evaluation takes beside values: views, pieces of their rays, shares of the orders."""
+        """What Evaluation takes beside values: views, pieces of their rays, shares of the orders."""
         views = {name: doubles(values) for name, values in self.views.items()}
-        rays, _, _ = self.sky.enter(*_where(views))
+        rays, _, _ = self.sky.enter(*where(views))
         pieces = [Pieces.of(optics, rays) for optics in self._optics]
         return views, pieces, [band.field.shares for band in self.sky.solutions]
 
@@ -270,15 +280,15 @@ class Linearization:
         views = {name: doubles(values[:1]) for name, values in self.views.items()}
         place = (self.views["altitude_m"][0], np.radians(self.views["sun_zenith_deg"][0]))
         shares = [band.field.shares for band in self.sky.solutions]
-        return _TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product)), (views, None, shares)
+        return TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product)), (views, None, shares)
 
     @cached_property
-    def _evaluation(self) -> _Evaluation:
+    def _evaluation(self) -> Evaluation:
         views, pieces, shares = self._arguments
         sizes = [dr.width(views["altitude_m"]), *(part and part.count for part in pieces), *map(len, shares)]
         key = [tuple(views), *sizes, *self._options.values(), *self._solving.values()]
         key += [(optics.make_up, optics.phase_kinds) for optics in self._optics]
-        return self.sky.grid.kept(("evaluation", *key), lambda: _Evaluation(self.sky, self._options))
+        return self.sky.grid.kept(("evaluation", *key), lambda: Evaluation(self.sky, self._options))
 
     def _arrays(self, outputs: list[Any]) -> dict[str, np.ndarray]:
         stacked = np.stack([v.numpy() for v in outputs], axis=-1)
@@ -304,195 +314,6 @@ class Linearization:
         outputs, changes = evaluation.forward(self._made, *arguments, values, views)
         self.__dict__.setdefault("value", self._arrays(outputs))
         return self._arrays(changes)
-
-
-class _Evaluation:
-    """The outputs of a sky as a function of values, views, pieces of their rays, and shares of the orders.
-
-    It and its derivatives are recorded (dr.freeze) where they are asked for more than once: tracing costs several
-    times what running does.
-    """
-
-    def __init__(self, sky: Sky, options: dict[str, Any]) -> None:
-        self._sky, self._options = sky, options
-        self._recordings = Recordings(sky.grid)
-        self._recorded = all(optics.phase_kinds is not None for optics in (band.optics for band in sky.solutions))
-
-    def __call__(self, *arguments: Any) -> list[Any]:
-        """All outputs, one Float [N] each, in the order of OUTPUTS and wavelengths."""
-        return self._run("value", self._outputs, *arguments)
-
-    def forward(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
-        """Outputs, and how they change along ``values`` and ``views``, the last two arguments (None: not at all)."""
-        *_, values, views = arguments
-        return self._run(("forward", values and tuple(values[0]), views is None), self._forward, *arguments)
-
-    def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-        """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
-        them the weights, Floats [N] in the order of the outputs."""
-        *arrays, of_values, of_views = arguments
-
-        def function(values: Any, views: Any, pieces: Any, shares: Any, weights: Any) -> tuple[Any, Any]:
-            values, views = copied(values), copied(views)
-            wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
-            dr.enable_grad(wanted)
-            outputs = self._outputs(values, views, pieces, shares)
-            pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
-            for output, weight in pairs:
-                dr.set_grad(output, weight)
-            dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
-            dr.traverse(dr.ADMode.Backward)
-            adjoints = dr.grad(wanted)
-            dr.eval(adjoints)
-            return adjoints
-
-        return self._run(("reverse", *of_values, *of_views), function, *arrays)
-
-    def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        with traversing():
-            return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
-
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], shares: list[Any]) -> list[Any]:
-        sky = self._sky.again(values, shares)
-        where = _where(views)
-        light = sky.rays(*where, **self._options, pieces=pieces)
-        sun, scattered = sky.irradiance(where[0], where[1])
-        zero = dr.zeros(types().Float, dr.width(where[0]))
-        outputs = [v + zero for v in (*light.radiance, *light.transmittance, *sun, *scattered)]
-        dr.eval(outputs)
-        return outputs
-
-    def _forward(
-        self, values: Any, views: Any, pieces: Any, shares: Any, along_values: Any, along_views: Any
-    ) -> tuple[list[Any], list[Any]]:
-        values, views = copied(values), copied(views)
-        pairs = [pair for name in along_views or () for pair in [(views[name], along_views[name])]]
-        for made, steps in zip(values, along_values or (), strict=False):
-            pairs += [pair for name in steps for pair in zip(flat(made[name]), flat(steps[name]), strict=True)]
-        for leaf, _ in pairs:
-            dr.enable_grad(leaf)
-        outputs = self._outputs(values, views, pieces, shares)
-        for leaf, step in pairs:
-            dr.set_grad(leaf, step)
-        dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in pairs))
-        dr.traverse(dr.ADMode.Forward)
-        changes = dr.grad(outputs)
-        dr.eval(changes)
-        return dr.detach(outputs), changes
-
-
-class _TableEvaluation(_Evaluation):
-    """The same for all combinations of view zenith angles and azimuths (radians) from one place under one sun, far
-    faster than ray by ray (bundle.py); not recorded."""
-
-    def __init__(
-        self,
-        sky: Sky,
-        options: dict[str, Any],
-        altitude_m: float,
-        sun_zenith: float,
-        view_zenith: np.ndarray,
-        azimuth: np.ndarray,
-    ) -> None:
-        super().__init__(sky, options)
-        self._recorded = False
-        self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
-
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, shares: list[Any]) -> list[Any]:
-        t, sky = types(), self._sky.again(values, shares)
-        altitude, sun_zenith = self._place
-        ground = self._options["ground"]
-        light = sky.table(altitude, self._view_zenith, sun_zenith, self._azimuth, ground=ground)
-        lane = dr.arange(t.UInt, len(self._view_zenith) * len(self._azimuth))
-        rows = lane // len(self._azimuth)
-        transmittance = [dr.gather(t.Float, evaluated(v), rows) for v in light.transmittance]
-        sun, scattered = sky.irradiance(*(doubles([v]) for v in self._place))
-        zero = dr.zeros(t.Float, dr.width(lane))
-        outputs = [v + zero for v in (*light.radiance, *transmittance, *sun, *scattered)]
-        dr.eval(outputs)
-        return outputs
-
-
-def _where(views: dict[str, Any]) -> list[Any]:
-    """Arguments of Sky.rays."""
-    degree = np.pi / 180.0
-    return [views["altitude_m"], *(views[name] * degree for name in VIEWS[1:4]), views.get("distance_m")]
-
-
-def differentiable(
-    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
-) -> dict[str, list[Any]]:
-    """What sky returns as Dr.Jit arrays that derivatives pass through: by output, W Floats [N].
-
-    ``parameters``: by name, Dr.Jit arrays (of one number, or as many as the parameter has) that take the place of the
-    atmosphere's values, and of the ``views``. Derivatives go from the outputs back to them (dr.backward) and the other
-    way (dr.forward); on the way the solver is asked for Linearization.vjp and jvp. ``options``: see Linearization.
-
-    Raises what Linearization raises, and InputError for a name that is no parameter.
-    """
-    air = Atmosphere.load(atmosphere)
-    outputs = dr.custom(_operation(), dict(parameters), lambda values: moved_to(air, views, values, **options))
-    count = len(outputs) // len(OUTPUTS)
-    return {name: outputs[i * count : (i + 1) * count] for i, name in enumerate(OUTPUTS)}
-
-
-def moved_to(
-    atmosphere: Any, views: Mapping[str, Any], parameters: Mapping[str, Any], **options: Any
-) -> Linearization:
-    """The linearization where ``parameters``, arrays by name, take the place of the atmosphere's and the views'."""
-    return Linearization(*replaced(Atmosphere.load(atmosphere), views, parameters), **options)
-
-
-def replaced(
-    air: Atmosphere, views: Mapping[str, Any], parameters: Mapping[str, Any]
-) -> tuple[Atmosphere, dict[str, Any]]:
-    """Atmosphere and views with other values of parameters."""
-    views = dict(views)
-    changes = {}
-    for name in check_names(air, tuple(parameters)):
-        value = np.array(parameters[name], dtype=np.float64).ravel()
-        if name in VIEWS:
-            views[name] = value if len(value) > 1 else float(value[0])
-        elif np.ndim(described(air, name)):
-            changes[name] = value.tolist() if len(value) > 1 else np.full(np.shape(described(air, name)), value[0])
-        else:
-            changes[name] = value.tolist() if len(value) > 1 else float(value[0])
-    return air.replace(changes) if changes else air, views
-
-
-def shaped(gradient: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A derivative by a parameter in the shape in which the parameter was given: one number may stand for all."""
-    return np.sum(gradient).reshape(shape) if np.prod(shape) == 1 else gradient.reshape(shape)
-
-
-@lru_cache(maxsize=1)
-def _operation() -> type:
-    class SkyOperation(dr.CustomOp):
-        def eval(self, parameters: Any, linearized: Any) -> list[Any]:
-            self.kinds = {name: type(value) for name, value in parameters.items()}
-            self.sizes = {name: len(value) for name, value in parameters.items()}
-            with dr.suspend_grad():
-                self.at = linearized(parameters)
-                return [floats(column) for name in OUTPUTS for column in self.at.value[name].T]
-
-        def forward(self) -> None:
-            changes = {name: np.array(v, np.float64) for name, v in self.grad_in("parameters").items()}
-            moved = self.at.jvp({name: v if len(v) > 1 else v[0] for name, v in changes.items()})
-            self.set_grad_out([floats(column) for name in OUTPUTS for column in moved[name].T])
-
-        def backward(self) -> None:
-            columns = np.stack([np.broadcast_to(v.numpy(), self.at.rays) for v in self.grad_out()], axis=-1)
-            weights = dict(zip(OUTPUTS, np.split(columns, len(OUTPUTS), axis=-1), strict=True))
-            found = self.at.vjp(weights, tuple(self.kinds))
-            self.set_grad_in(
-                "parameters",
-                {n: kind(shaped(found[n], (self.sizes[n],)).tolist()) for n, kind in self.kinds.items()},
-            )
-
-        def name(self) -> str:
-            return "sky"
-
-    return SkyOperation
 
 
 def linearize(atmosphere: Any, views: Mapping[str, Any], **options: Any) -> Linearization:

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from .derivatives import Linearization, moved_to, shaped
+from .derivatives import Linearization
+from .operation import moved_to, shaped
 from .views import check_views
 
 

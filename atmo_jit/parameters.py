@@ -7,7 +7,7 @@ those numbers, exact far beyond the single precision of the kernels.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -106,3 +106,20 @@ def like(tree: Any, leaves: list[Any]) -> Any:
         return [build(p) for p in part] if isinstance(part, list) else next(remaining)
 
     return build(tree)
+
+
+def replaced(
+    air: Atmosphere, views: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> tuple[Atmosphere, dict[str, Any]]:
+    """Atmosphere and views with other values of parameters."""
+    views = dict(views)
+    changes = {}
+    for name in check_names(air, tuple(parameters)):
+        value = np.array(parameters[name], dtype=np.float64).ravel()
+        if name in VIEWS:
+            views[name] = value if len(value) > 1 else float(value[0])
+        elif np.ndim(described(air, name)):
+            changes[name] = value.tolist() if len(value) > 1 else np.full(np.shape(described(air, name)), value[0])
+        else:
+            changes[name] = value.tolist() if len(value) > 1 else float(value[0])
+    return air.replace(changes) if changes else air, views

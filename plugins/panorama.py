@@ -209,7 +209,7 @@ def _following(values: list[Any], output: str, sky: Any, views: dict[str, Any], 
     """The values, with the derivatives of an output of the sky by parameters."""
     if not parameters:
         return values
-    from atmo_jit.derivatives import differentiable
+    from atmo_jit.operation import differentiable
 
     options = {"tolerance": sky.tolerance, "resolution": sky.resolution}
     moved = differentiable(sky.atmosphere, views, parameters, **options)[output]

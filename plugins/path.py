@@ -248,7 +248,9 @@ class AtmospherePath:
             aovs += [values[i] for i in range(len(values))]
         return mi.Spectrum(result), seen, aovs
 
-    def _inscatter(self, scene: Any, sampler: Any, ray: Any, part: Any, light: Skylight, air: Airlight, active: Any):
+    def _inscatter(
+        self, scene: Any, sampler: Any, ray: Any, part: Any, light: Skylight, air: Airlight, active: Any
+    ) -> list[Any]:
         """What the air of a segment scatters, less what shapes keep the sun from."""
         if not self._shades(scene, air):
             return part.light

@@ -10,8 +10,9 @@ from tolerances import ADJOINT, DERIVATIVE_BY_COEFFICIENT, DERIVATIVE_BY_G, DIFF
 
 import atmo_jit
 from atmo_jit.backend import types
-from atmo_jit.derivatives import OUTPUTS, Linearization, differentiable, jacobian
+from atmo_jit.derivatives import OUTPUTS, Linearization, jacobian
 from atmo_jit.errors import InputError
+from atmo_jit.operation import differentiable
 from atmo_jit.parameters import RADII, VIEWS, described, parameter_names, per_wavelength
 
 EARTH = atmo_jit.Atmosphere.load("earth").replace({"mie.scattering_per_m": [1.2e-5, 1.4e-5, 1.9e-5]})

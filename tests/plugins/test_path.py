@@ -230,3 +230,25 @@ def test_one_emitter_is_needed(rgb):
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "atmosphere_path"}, "sensor": sensor})
     with pytest.raises((InputError, RuntimeError), match="0 emitters of type atmosphere"):
         scene.integrator().render(scene, spp=1)
+
+
+def test_the_unit_of_length_does_not_matter(rgb):
+    """The same scene in metres and in kilometres, with the planet's centre given and not."""
+    pictures = []
+    for scale, center in ((1.0, None), (1e-3, None), (1e-3, [0.0, 0.0, -6361.0])):
+        at = mi.ScalarTransform4f()
+        options = {} if center is None else {"center": mi.ScalarPoint3f(center)}
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "atmosphere_path", "max_depth": 3, "scale": scale, **options},
+                "sky": {"type": "atmosphere", "sun_direction": [0.2, 1.0, 0.3], "altitude": 1000.0, "sun_scale": 0.0},
+                "sensor": camera(8, 8, [0, 0, 0], [0, 1, 0.1], near_clip=1e-2 * scale, far_clip=1e8),
+                "hill": {"type": "sphere", "center": [0, 9e3 * scale, -1e3 * scale], "radius": 2.5e3 * scale},
+                "wall": {"type": "cube", "to_world": at.scale(scale).translate([3e3, 6e3, 0]).scale([400, 100, 2e3])},
+            }
+        )
+        pictures.append(passes(scene, 1, 64)[0])
+    np.testing.assert_allclose(pictures[1].mean(axis=(0, 1)), pictures[0].mean(axis=(0, 1)), rtol=2e-3)
+    np.testing.assert_allclose(pictures[2].mean(axis=(0, 1)), pictures[0].mean(axis=(0, 1)), rtol=2e-3)
+    assert np.median(np.abs(pictures[1] / pictures[0] - 1.0)) < 5e-3
