@@ -22,7 +22,7 @@ from atmo_jit.sky import Sky
 
 from .globe import Globe
 
-NODES = 2  # of each piece of a ray: 0.04 % of radiance beside the four of Sky.rays
+NODES = 2  # of each piece of a ray; `python -m bench.airlight` has what that costs beside the four of Sky.rays
 GOLDEN = 0.6180339887
 QUADRATURE = gauss_legendre(4)
 FIRST_PARTS = 4  # of the way to where shadows may begin
