@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.page:
         relative = Path(given.pictures or "images/gallery")
         folder = relative.relative_to(given.page.parent) if relative.is_relative_to(given.page.parent) else relative
-        named = f"--scenes {' '.join(given.scenes)} " if given.scenes else ""
+        named = (f"--scenes {' '.join(given.scenes)} " if given.scenes else "") + ("--times " if given.times else "")
         given.page.write_text(page(rows, given.spp, str(folder), named), encoding="utf-8")
     return 0
 
