@@ -1,7 +1,8 @@
 """View rays cut into pieces for a quadrature: geometry, densities and columns, in double precision.
 
 Nothing here depends on how much the matter scatters or absorbs, except how finely thick shells are cut. So what is made
-for a few rays is kept, and serves the next atmosphere with the same profiles.
+for a few rays is kept, and serves the next atmosphere with the same profiles. Rays and pieces are NumPy's; the nodes in
+them, which are many, are made by a kernel.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Any, ClassVar
 
+import drjit as dr
 import numpy as np
 
-from ..backend import floats, types, uints
+from ..backend import doubles, floats, stored, types, uints
 from ..grid import profile_key
 from ..march import MAX_TURN
 from ..optics import Optics
@@ -65,7 +67,11 @@ class Rays:
         stop: np.ndarray | None = None,
         ground: np.ndarray | bool | None = None,
     ) -> None:
+        t = types()
         self._air, self._profiles = optics.atmosphere, [c.profile for c in optics.constituents]
+        numbers = [[t.Float64(number) for number in of_part] for of_part in optics.profiles]
+        dr.eval(numbers)
+        self._device_profiles = [type(p)(*n) for p, n in zip(self._profiles, numbers, strict=True)]
         self.mu = mu
         radius, top = self._air.bottom_radius_m, self._air.top_radius_m
         self.r = r = radius + h
@@ -93,6 +99,7 @@ class Rays:
         density = self.densities(ray, self._shells[1] + length * X[:, None])
         self._columns = np.einsum("g,kgp->kp", W, density) * length
         there = self._altitude(np.arange(len(mu)), self.stop)[1]
+        self._buffers = [doubles(v) for v in (r, mu, sine)]
         self.ends = floats(np.column_stack([(r + self.stop * mu) / there, self.stop * sine / there, sine, mu]))
         self._pieces: dict[bytes, Pieces] = {}
 
@@ -113,28 +120,34 @@ class Rays:
         found = [np.asarray(profile.density(h)) for profile in self._profiles]
         return np.array(found).reshape(len(self._profiles), *h.shape)
 
-    def table(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> Any:
-        """Per point: square root of the unit altitude, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn
+    def at(self, ray: Any, distance: Any, half: Any) -> tuple[Any, list[Any]]:
+        """Table of points on rays, and the density of every constituent there, evaluated; Dr.Jit arrays, ``distance``
+        and half the stretch that a point stands for, ``half``, in double precision (m).
+
+        Per point: square root of the unit altitude, horizon cosine, 1 / (1 - horizon), cosine and sine of the turn
         about the planet's centre, the ray's zenith cosine there, half the stretch over r, half the disc's height in
-        cosines."""
-        air = self._air
-        h, r = self._altitude(ray, distance)
-        horizon = -np.sqrt(h * (2.0 * air.bottom_radius_m + h)) / r
-        disc = np.maximum(np.deg2rad(air.sun_angular_radius_deg) * air.bottom_radius_m / r, 1e-7)
-        return floats(
-            np.column_stack(
-                [
-                    np.sqrt(np.clip(h / air.thickness_m, 0.0, 1.0)),
-                    horizon,
-                    1.0 / (1.0 - horizon),
-                    (self.r[ray] + distance * self.mu[ray]) / r,
-                    distance * self.sine[ray] / r,
-                    np.clip((self.r[ray] * self.mu[ray] + distance) / r, -1.0, 1.0),
-                    half / r,
-                    disc,
-                ]
-            )
-        )
+        cosines.
+        """
+        t, air = types(), self._air
+        radius, thickness = (dr.opaque(t.Float64, v, 1) for v in (air.bottom_radius_m, air.thickness_m))
+        disc = dr.opaque(t.Float64, np.deg2rad(air.sun_angular_radius_deg) * air.bottom_radius_m, 1)
+        r, mu, sine = (dr.gather(t.Float64, v, ray) for v in self._buffers)
+        there = dr.sqrt(dr.maximum(r * r + distance * (2.0 * r * mu + distance), 0.0))
+        h = dr.maximum(there - radius, 0.0)
+        horizon = -dr.sqrt(h * (2.0 * radius + h)) / there
+        columns = [
+            dr.sqrt(dr.minimum(h / thickness, 1.0)),
+            horizon,
+            1.0 / (1.0 - horizon),
+            (r + distance * mu) / there,
+            distance * sine / there,
+            dr.clip((r * mu + distance) / there, -1.0, 1.0),
+            half / there,
+            dr.maximum(disc / there, 1e-7),
+        ]
+        densities = [profile.density(h) for profile in self._device_profiles]
+        dr.schedule(densities)
+        return stored([t.Float(c) for c in columns], dr.arange(t.UInt, dr.width(ray)), len(columns)), densities
 
     def _altitude(self, ray: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Altitude and radius (m) of points on rays, [..., len(ray)]."""
@@ -170,22 +183,42 @@ class Pieces:
 
 
 class Nodes:
-    """Nodes in pieces: ``ray`` [P]; ``distance`` and ``length`` (weight, m) [node, P]; ``densities`` and ``columns``
-    from the start of the ray [constituent, node, P]; ``first`` [R + 1]: pieces of each ray; ``first_node`` the same of
-    nodes; ``table``: Rays.table of the nodes [P, node]."""
+    """Nodes in pieces, piece by piece. NumPy: ``ray`` [P]; ``distance`` [P, node] (m); ``first`` [R + 1]: pieces of
+    each ray. Dr.Jit, evaluated: ``first_node``, the same of nodes; ``table`` and ``densities``: Rays.at; ``columns``
+    from the start of the ray (per constituent) and ``length`` (weight) in double precision (m)."""
 
     def __init__(self, pieces: Pieces, seen: np.ndarray, count: int) -> None:
-        self.rays = rays = pieces.rays
-        self.ray, near, step = pieces.ray[seen], pieces.near[seen], pieces.step[seen]
+        t, self.rays = types(), pieces.rays
+        rays = self.rays
         x, w = gauss_legendre(count)
-        running = np.einsum("gf,kfp->kgp", running_integral(4, tuple(x)), pieces.density[..., seen])
-        self.columns = pieces.from_start[:, None, seen] + running * step
-        self.distance, self.length = near + step * x[:, None], w[:, None] * step
-        self.densities = rays.densities(self.ray, self.distance)
+        self.ray, near, step = pieces.ray[seen], pieces.near[seen], pieces.step[seen]
+        self.distance = near[:, None] + step[:, None] * x
         self.first = np.searchsorted(self.ray, np.arange(len(rays.mu) + 1))
         self.first_node = uints(self.first * count)
-        every = np.repeat(self.ray, count), self.distance.T.ravel(), np.repeat(0.5 * step / count, count)
-        self.table = rays.table(*every)
+        if not len(self.ray):  # no ray meets air
+            nothing = [t.Float64()] * len(pieces.density)
+            self.length, self.columns, self.densities, self.table = t.Float64(), nothing, nothing, t.Float()
+            return
+        lane = dr.arange(t.UInt, self.distance.size)
+        piece = lane // count
+        node = lane - piece * count
+
+        def of_piece(values: np.ndarray) -> Any:
+            return dr.gather(t.Float64, doubles(values), piece)
+
+        def of_node(values: np.ndarray) -> Any:
+            return dr.gather(t.Float64, doubles(values), node)
+
+        step = of_piece(step)
+        self.length = of_node(w) * step
+        running = [of_node(share) for share in running_integral(4, tuple(x)).T]
+        self.columns = [
+            dr.fma(step, sum(a * of_piece(d) for a, d in zip(running, density, strict=True)), of_piece(before))
+            for density, before in zip(pieces.density[..., seen], pieces.from_start[:, seen], strict=True)
+        ]
+        dr.schedule(self.length, self.columns)
+        ray, half = dr.gather(t.UInt, uints(self.ray), piece), (0.5 / count) * step
+        self.table, self.densities = rays.at(ray, dr.fma(step, of_node(x), of_piece(near)), half)
 
 
 def sums(values: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -13,13 +13,14 @@ over the stretch that a node stands for. ``python -m bench.tables`` prints what 
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ..backend import floats, packet, padded, types, uints
+from ..backend import doubles, floats, packet, padded, stored, types, uints
 from ..march import relative_azimuth
 from ..optics import Optics
 from ..single_scattering import horizontal_irradiance
@@ -38,8 +39,7 @@ class Sightlines:
     to go on through it, in air as it is on the ground. ``stretches``: the field of later orders is asked once in about
     so many parts of a ray (0: in every piece). All arrays are float64 [R].
 
-    Attributes: ``start``, ``stop`` [R]; ``ground`` [R]: the ray ends there; ``transmittance`` [R, C]; ``scattering``
-    [R, K, C]: integral of scattering coefficient times transmittance along the ray, for every scatterer.
+    Attributes: ``start``, ``stop`` [R]; ``ground`` [R]: the ray ends there; ``transmittance`` [R, C]; ``scattering``.
     """
 
     def __init__(
@@ -54,28 +54,60 @@ class Sightlines:
         nodes: int = NODES,
     ) -> None:
         self.optics = optics
-        scattering, extinction = _coefficients(optics)
         rays = Rays.of(optics, h, mu, start, stop, ground)
         self.start, self.stop, self.ground = rays.start, rays.stop, rays.ground
+        extinction = np.array([c.extinction_per_m[optics.indices] for c in optics.constituents])
+        extinction = extinction.reshape(-1, optics.channel_count)
         whole = rays.pieces(extinction)
         self.transmittance = np.exp(-(extinction.T @ whole.total)).T
-        seen = (extinction.T @ whole.from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
-        at = whole.nodes(seen, nodes)
-        through = np.exp(-np.einsum("kc,kgp->gpc", extinction, at.columns)) * at.length[..., None]
-        weight = np.einsum("kc,kgp,gpc->pgkc", scattering, at.densities[optics.scatterers], through)
-        self.scattering = sums(weight.sum(axis=1), at.first)
-        self._pieces, self._parts = (at, weight), stretches
-        self._nodes, self._first_node, self._ends = at.table, at.first_node, rays.ends
-        self._weights = _padded_channels(weight.reshape(weight.shape[0] * nodes, *weight.shape[2:]))
+        self._pieces, self._parts, self._ends = whole, stretches, rays.ends
+        self._seen = (extinction.T @ whole.from_start).min(axis=0, initial=np.inf) < SPENT_DEPTH
+        self._place(nodes)
         through = np.where(self.ground[:, None], self.transmittance, 0.0)
         self._through = floats(np.pad(through, ((0, 0), (0, padded(optics.channel_count) - optics.channel_count))))
+
+    def with_nodes(self, nodes: int) -> Sightlines:
+        """The same rays with so many nodes per piece."""
+        other = copy(self)
+        for kept in ("_by_node", "scattering", "_stretches"):
+            vars(other).pop(kept, None)
+        other._place(nodes)
+        return other
+
+    def _place(self, nodes: int) -> None:
+        self._count, self._at = nodes, self._pieces.nodes(self._seen, nodes)
+        self._weights = self._weighed()
+
+    def _weighed(self) -> Any:
+        """Scattering coefficient times transmittance times length at every node: [node, scatterer, padded channel]."""
+        t, optics, at = types(), self.optics, self._at
+        if not optics.scatterers or not len(at.ray):
+            return t.Float()
+        channels = optics.channel_count
+        through = [at.length * dr.exp(-t.Float64(depth)) for depth in optics.optical_depths(at.columns)]
+        none = [t.Float(0.0)] * (padded(channels) - channels)
+        weights = []
+        for k in optics.scatterers:
+            weights += [t.Float(optics.scattering[k][c] * at.densities[k] * through[c]) for c in range(channels)] + none
+        return stored(weights, dr.arange(t.UInt, dr.width(at.length)), len(weights))
+
+    @cached_property
+    def _by_node(self) -> np.ndarray:
+        """Those weights, [piece, node, scatterer, channel]."""
+        kinds, channels = len(self.optics.scatterers), self.optics.channel_count
+        return self._weights.numpy().reshape(len(self._at.ray), self._count, kinds, padded(channels))[..., :channels]
+
+    @cached_property
+    def scattering(self) -> np.ndarray:
+        """Integral of scattering coefficient times transmittance along the rays [R, K, C], for every scatterer."""
+        return sums(self._by_node.sum(axis=1, dtype=np.float64), self._at.first)
 
     @cached_property
     def _stretches(self) -> tuple[Any, Any, Any]:
         """Neighbouring pieces as stretches with about equal shares of what the ray scatters: table of their centroids,
         weights, and the first of each ray."""
-        (at, weight), parts = self._pieces, self._parts
-        rays, ray, distance = at.rays, at.ray, at.distance.T
+        at, weight, parts = self._at, self._by_node, self._parts
+        rays, ray, distance = at.rays, at.ray, at.distance
         channels = np.maximum(self.scattering.sum(axis=1), 1e-300)
         share = (weight.sum(axis=2) / channels[ray][:, None]).mean(axis=2)
         by_piece = share.sum(axis=1)
@@ -90,7 +122,7 @@ class Sightlines:
         lit = total > 0.0
         centre = np.where(lit, moment / np.where(lit, total, 1.0), distance[first, 0])
         return (
-            rays.table(ray, centre, np.zeros(len(first))),
+            rays.at(uints(ray), doubles(centre), types().Float64(0.0))[0],
             _padded_channels(np.add.reduceat(weight.sum(axis=1), first)),
             uints(np.searchsorted(ray, np.arange(len(self.stop) + 1))),
         )
@@ -112,22 +144,29 @@ class Sightlines:
         solar = self.optics.solar
 
         def node(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            row, horizon, scale, cos_turn, sin_turn, mu, half, disc = packet(self._nodes, i, 8)
+            row, horizon, scale, cos_turn, sin_turn, mu, half, disc = packet(self._at.table, i, 8)
             there = dr.fma(cos_turn, mu_s, sin_turn * across)
             above = there - horizon
             width = dr.maximum(disc, dr.abs(dr.fma(-there, mu, nu)) * half)
-            x = dr.clip(dr.fma(0.5, above / width, 0.5), 0.0, 1.0)
-            seen = x * x * dr.fma(-2.0, x, 3.0)
-            light = sunlight.at(row, dr.sqrt(dr.maximum(above * scale, 0.0)))
-            weight = packet(self._weights, i, kinds * size)
-            for n in range(kinds):
-                for c in range(channels):
-                    sums[n * channels + c] = dr.fma(weight[n * size + c] * seen, light[c], sums[n * channels + c])
+
+            def lit(sums: list[Any]) -> list[Any]:
+                x = dr.minimum(dr.fma(0.5, above / width, 0.5), 1.0)
+                seen = x * x * dr.fma(-2.0, x, 3.0)
+                light = sunlight.at(row, dr.sqrt(dr.maximum(above * scale, 0.0)))
+                weight = packet(self._weights, i, kinds * size)
+                return [
+                    dr.fma(weight[n * size + c] * seen, light[c], sums[n * channels + c])
+                    for n in range(kinds)
+                    for c in range(channels)
+                ]
+
+            # Under a low sun most nodes lie in the planet's shadow, and neighbouring lanes' together.
+            (sums,) = dr.if_stmt((sums,), above > -width, lambda s: (lit(s),), lambda s: (s,))
             return i + 1, sums
 
         sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
         if kinds:
-            start, end = (dr.gather(t.UInt, self._first_node, ray + o) for o in (0, 1))
+            start, end = (dr.gather(t.UInt, self._at.first_node, ray + o) for o in (0, 1))
             _, sums = dr.while_loop((start, sums), lambda i, _: i < end, node, label="sightlines: single")
         single = [[sums[n * channels + c] * solar[c] for c in range(channels)] for n in range(kinds)]
         dr.eval(single)
@@ -169,14 +208,6 @@ class Sightlines:
         glow = [through[c] * albedo * dr.inv_pi * (sun[c] + sky[c]) for c, albedo in enumerate(self.optics.albedo)]
         dr.eval(glow)
         return glow
-
-
-def _coefficients(optics: Optics) -> tuple[np.ndarray, np.ndarray]:
-    """Scattering [scatterer, channel] and extinction [constituent, channel], 1/m."""
-    count = optics.channel_count
-    scattering = [optics.constituents[k].scattering_per_m[optics.indices] for k in optics.scatterers]
-    extinction = [c.extinction_per_m[optics.indices] for c in optics.constituents]
-    return np.array(scattering).reshape(-1, count), np.array(extinction).reshape(-1, count)
 
 
 def _padded_channels(values: np.ndarray) -> Any:
