@@ -6,7 +6,7 @@ are opaque to the compiler, so that another atmosphere of the same make-up reuse
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from copy import copy
 from dataclasses import fields, replace
 from functools import cached_property, lru_cache
@@ -166,12 +166,28 @@ class Optics:
 
     def phase_values(self, constituent: int, nu: Any) -> list[Any]:
         """Phase function (1/sr) of a constituent per channel at the cosine ``nu`` of the scattering angle."""
+        phases, place = self._phases(constituent)
+        values = [p.value(nu) for p in phases]
+        return [values[i] for i in place]
+
+    def phase_function(self, constituent: int) -> Callable[[Any], list[Any]]:
+        """``phase_values`` as a function of nu for many look-ups: what does not depend on nu is computed here."""
+        phases, place = self._phases(constituent)
+        parts = [p.prepared() if hasattr(p, "prepared") else p.value for p in phases]
+
+        def values(nu: Any) -> list[Any]:
+            found = [part(nu) for part in parts]
+            return [found[i] for i in place]
+
+        return values
+
+    def _phases(self, constituent: int) -> tuple[list[Any], list[int]]:
+        """The phase functions that differ, and which of them is that of each channel."""
         phase = self.constituents[constituent].phase
         phases, place = _distinct([phase.at(int(i)) for i in self.indices])
         if self.asymmetry[constituent]:
             phases = [replace(p, g=g) for p, g in zip(phases, self.asymmetry[constituent], strict=True)]
-        values = [p.value(nu) for p in phases]
-        return [values[i] for i in place]
+        return phases, place
 
     def phase_table(self, degree: int) -> Any:
         """Legendre series of the phase functions up to ``degree`` at PHASE_NODES cosines from -1 to 1: table [node,

@@ -68,6 +68,29 @@ class _OneParameter:
         nu = asarray(nu)
         return self._density(nu[..., None] if isinstance(self.g, np.ndarray) else nu, self.g)
 
+    def prepared(self) -> Callable[[Any], Any]:
+        """``value`` of a Dr.Jit ``g``, with what depends on that alone computed once, and not at every look-up."""
+        constants = self._constants(self.g)
+        if not module_of(self.g).grad_enabled(constants):
+            module_of(self.g).eval(constants)
+        return lambda nu: self._with(constants, nu, self.g)
+
+    def _density(self, nu: Any, g: Any) -> Any:
+        return self._with(self._constants(g), nu, g)
+
+    def _constants(self, g: Any) -> tuple[Any, ...]:
+        """Scale, |g| and (1 - |g|)^2."""
+        size = abs(g)
+        return self._scale(g), size, (1.0 - size) * (1.0 - size)
+
+    def _with(self, constants: tuple[Any, ...], nu: Any, g: Any) -> Any:
+        """The density: its divisor is (1 + g^2 - 2 g nu)^(3/2), without the cancellation that costs float32 its digits
+        in a sharp forward (or backward) peak."""
+        xp, (scale, size, gap) = module_of(nu, g), constants
+        from_peak = xp.fma(-g, nu, size) if xp is not np else size - g * nu
+        squared = 2.0 * from_peak + gap
+        return scale * self._weight(nu) / (squared * xp.sqrt(squared))
+
     def moments(self, order: int) -> Any:
         """Legendre moments chi_0 .. chi_order (see the module's table of shapes)."""
         chi = self._moments(order)
@@ -85,8 +108,11 @@ class HenyeyGreenstein(_OneParameter):
     g: Any
     type = "henyey_greenstein"
 
-    def _density(self, nu: Any, g: Any) -> Any:
-        return 0.25 / math.pi * (1.0 - g * g) / _cubed_distance(nu, g)
+    def _scale(self, g: Any) -> Any:
+        return 0.25 / math.pi * (1.0 - g * g)
+
+    def _weight(self, nu: Any) -> Any:
+        return 1.0
 
     def _moments(self, order: int) -> list[Any]:
         return _powers(self.g, order)
@@ -106,8 +132,11 @@ class CornetteShanks(_OneParameter):
     g: Any
     type = "cornette_shanks"
 
-    def _density(self, nu: Any, g: Any) -> Any:
-        return 0.375 / math.pi * (1.0 - g * g) / (2.0 + g * g) * (1.0 + nu * nu) / _cubed_distance(nu, g)
+    def _scale(self, g: Any) -> Any:
+        return 0.375 / math.pi * (1.0 - g * g) / (2.0 + g * g)
+
+    def _weight(self, nu: Any) -> Any:
+        return 1.0 + nu * nu
 
     def _moments(self, order: int) -> list[Any]:
         peak = _powers(self.g, order + 2)
@@ -291,15 +320,6 @@ def phase_from_dict(phase: Any, wavelengths: int) -> Phase:
         if "g" in keys and not np.isscalar(phase["g"]):
             per_wavelength(phase["g"], "g", wavelengths, ASYMMETRY)
         return make(*(phase[key] for key in keys))
-
-
-def _cubed_distance(nu: Any, g: Any) -> Any:
-    """(1 + g^2 - 2 g nu)^(3/2), without the cancellation that costs float32 its digits in a sharp forward (or backward)
-    peak."""
-    xp, size = module_of(nu, g), abs(g)
-    from_peak = xp.fma(-g, nu, size) if xp is not np else size - g * nu
-    squared = 2.0 * from_peak + (1.0 - size) * (1.0 - size)
-    return squared * xp.sqrt(squared)
 
 
 def _powers(g: Any, order: int) -> list[Any]:

@@ -168,19 +168,19 @@ class _Table:
     """One band's cells and the rows of its transmittance."""
 
     def __init__(self, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> None:
-        self.optics, self.peaks = optics, list(light.peaks)
+        self.phases = [optics.phase_function(k) for k in light.peaks]
         self.channels = optics.channel_count
         self.up, self.down, columns = size
         values, self.colours, greys = light.smooth, [], []
         nu = floats(nodes.nu)
         # Peaks taken apart, as the module says.
         toward_sun = uints([nodes.sun_row * columns])
-        for k, single in light.peaks.items():
+        for phase, single in zip(self.phases, light.peaks.values(), strict=True):
             grey = sum(single) / self.channels
             in_sun = [dr.gather(types().Float, v, toward_sun) for v in single]
             mean = dr.maximum(sum(in_sun) / self.channels, 1e-30)
             colour = [v / mean for v in in_sun]
-            parts = zip(values, single, colour, optics.phase_values(k, nu), strict=True)
+            parts = zip(values, single, colour, phase(nu), strict=True)
             values = [dr.fma(s - grey * shade, phase, v) for v, s, shade, phase in parts]
             self.colours.append(colour)
             greys.append(grey)
@@ -201,9 +201,8 @@ class _Table:
         j = types().Int(column)
         value = self.cells.at(i, y, j, column - types().Float(j))
         radiance = value[: self.channels]
-        for k, grey, colour in zip(self.peaks, value[self.channels :], self.colours, strict=True):
-            phase = self.optics.phase_values(k, nu)
-            radiance = [dr.fma(p * grey, shade, v) for p, shade, v in zip(phase, colour, radiance, strict=True)]
+        for phase, grey, colour in zip(self.phases, value[self.channels :], self.colours, strict=True):
+            radiance = [dr.fma(p * grey, shade, v) for p, shade, v in zip(phase(nu), colour, radiance, strict=True)]
         return [dr.maximum(v, 0.0) for v in radiance]
 
     def through(self, up: Any, row: Any) -> list[Any]:
