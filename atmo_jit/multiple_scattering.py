@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, types
+from .backend import floats
 from .column import SunColumns
 from .field import Field
 from .gather import Gather
@@ -44,20 +44,19 @@ def solve(
     most = orders or resolution.orders
     values = optics.values(resolution.degrees, resolution.phase_degree)
     done = steps.start(values, min(AT_ONCE, most))
-    later, probes = done["later"], [p.numpy() for p in done["probes"]]
+    later = done["later"]
+    probes = [steps.probe(light, done, n) for n, light in enumerate(later, 2)]
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
     for n in range(AT_ONCE, most + 1):
         if orders is None and later:
-            shape = (len(probes), grid.shape[0], grid.shape[1], 2, optics.channel_count)
-            weights, error = _extrapolated(np.reshape(probes, shape))
+            weights, error = _extrapolated(np.stack(probes))
             arriving = weights
             if error < resolution.converged * tolerance:
                 break
         if n == most:
             break
-        light, probe = steps.step(values, done, later[-1], n + 1)
-        later.append(light)
-        probes.append(probe.numpy())
+        later.append(steps.step(values, done, later[-1], n + 1))
+        probes.append(steps.probe(later[-1], done, n + 1))
     if orders is not None and later:
         arriving = np.ones((len(later), grid.shape[1], optics.channel_count))
         weights = arriving.copy()
@@ -139,13 +138,13 @@ class _Steps:
         """Orders 1 to ``count``, the reference, and what the next order needs."""
         return self._run(("start", count), lambda v: self.started(v, count), values)
 
-    def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> tuple[Any, Any]:
-        """Order ``n`` from the one before, and its probe."""
+    def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> Any:
+        """Order ``n`` from the one before."""
         stage, before = self._stage(n), self._stage(n - 1)
         if stage != before or n == 2:
             done["gather"] = None
         key = ("step", stage, before, n == 2, done["gather"] is None)
-        light, probe, done["gather"] = self._run(
+        light, done["gather"] = self._run(
             key,
             lambda v, reference, gather, light: self._step(v, reference, gather, light, n),
             values,
@@ -153,7 +152,15 @@ class _Steps:
             done["gather"],
             light,
         )
-        return light, probe
+        return light
+
+    def probe(self, light: Any, done: dict[str, Any], n: int) -> np.ndarray:
+        """The moments of order ``n`` of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
+        channels, (altitudes, suns) = self._optics.channel_count, self._grid.shape
+        inverse = done["reference"]["inverse"].numpy().reshape(altitudes, len(self._grid.first_theta), -1)
+        inverse = inverse[:, :: self._grid.first, :channels]
+        light = Moments(light, *self._degree(n), suns, channels)
+        return np.swapaxes(light.numpy()[:, :2, :suns] * inverse[:, None], 1, 2)
 
     def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
         """What Field holds: moments, sky and reflected irradiance."""
@@ -187,24 +194,23 @@ class _Steps:
         project = Projection.at(grid, fine, *self._degree(1))
         first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
         reference = Reference.above(grid, first)
-        later, probes, light, gather = [], [], first, None
+        later, light, gather = [], first, None
         for n in range(2, count + 1):
             if n > 2 and self._stage(n) != self._stage(n - 1):
                 gather = None
             gather = gather or self._gather(optics, reference, n, None)
             light = self._next(gather, light, n)
             later.append(light.values)
-            probes.append(_probe(light, grid, reference))
         held = gather and gather.held
-        return {"first": first.values, "reference": reference.held, "later": later, "probes": probes, "gather": held}
+        return {"first": first.values, "reference": reference.held, "later": later, "gather": held}
 
-    def _step(self, values: Any, reference: Any, gather: Any, light: Any, n: int) -> tuple[Any, Any, Any]:
+    def _step(self, values: Any, reference: Any, gather: Any, light: Any, n: int) -> tuple[Any, Any]:
         optics, grid = self._optics.with_values(values), self._grid
         reference = Reference.of(grid, optics.channel_count, reference)
         suns = len(grid.first_theta) if n == 2 else grid.shape[1]
         gather = self._gather(optics, reference, n, gather)
         light = self._next(gather, Moments(light, *self._degree(n - 1), suns, optics.channel_count), n)
-        return light.values, _probe(light, grid, reference), gather.held
+        return light.values, gather.held
 
     def _gather(self, optics: Optics, reference: Reference, n: int, held: Any) -> Gather:
         stage, r = self._stage(n), self._resolution
@@ -225,19 +231,6 @@ class _Steps:
         first = Moments(first, *self._degree(1), len(grid.first_theta), channels)
         rest = [Moments(v, *self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
         return total_of(optics, self._columns, grid, reference, first, rest, shares)
-
-
-def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:
-    """The moments of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
-    t, (altitudes, suns), channels = types(), grid.shape, order.channels
-    lane = dr.arange(t.UInt, altitudes * suns * 2 * channels)
-    channel, place = lane % channels, lane // channels
-    entry, node = place % 2, place // 2
-    sun, k = node % suns, node // suns
-    values = dr.gather(t.Float, dr.detach(order.values), order.index(k, entry, sun, channel))
-    values = values * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    dr.eval(values)
-    return values
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:

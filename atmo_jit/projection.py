@@ -66,6 +66,10 @@ class Moments:
         """Place of a value."""
         return ((k * self.entries + entry) * room(self.suns) + sun) * self.channels + channel
 
+    def numpy(self) -> np.ndarray:
+        """``values`` with their axes."""
+        return self.values.numpy().reshape(-1, self.entries, room(self.suns), self.channels)
+
 
 class Projection:
     """From azimuthal harmonics at the nodes to moments and irradiance.
