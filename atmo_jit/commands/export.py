@@ -27,7 +27,7 @@ from atmo_jit.progress import progress_bar
 @click.option(
     "--texels",
     type=click.Choice(TEXELS),
-    help="exact: right at their centres (default); fitted: least error between the suns (takram and its like).",
+    help="fitted: least error between the suns (default of takram and its like); exact: right at their centres.",
 )
 @click.option("--tolerance", type=float, default=0.01, show_default=True, help="Relative error to aim for, in (0, 1).")
 @click.option("--orders", type=click.IntRange(min=1), help="Scattering and reflection events, as for atmo-jit sky.")

@@ -29,7 +29,8 @@ TEXELS = ("exact", "fitted")
 class Options:
     """What a layout lets one choose; None: what the layout has by default.
 
-    ``texels``: "exact" at their centres, or "fitted" to err least between the suns (see :mod:`.fitting`).
+    ``texels``: "fitted" to err least between the suns (see :mod:`.fitting`; default of the family of ``takram``), or
+    "exact" at their centres.
     ``mu_s_min``: cosine of the lowest sun of the scattering table. ``size``: texels of it. ``precision``: "half" or
     "float". ``colour``: "samples" or "spectral" (see :mod:`.colour`). ``tolerance``, ``orders``: of the solution, as
     for :class:`atmo_jit.Sky`. ``altitude_m``, ``sun_zenith_deg``: of tables for one observer and sun.

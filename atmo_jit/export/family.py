@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from ..backend import doubles
 from ..bake.client import SCATTERING, WHOLE, Block, bruneton_tables, scattering_nodes
 from ..bake.error import compare
 from ..errors import InputError
+from ..mapping import Bruneton
 from ..phase import RayleighPhase
 from ..sky import Sky
 from . import bruneton, cosmoscout, takram
 from .colour import Channels, channels, described
 from .containers import File, source
 from .exporter import Clock, Made, Options, only
-from .fitting import dense_size, fitted
+from .fitting import fitted
 from .lookup import ClientTables
 from .parameters import Aerosol, aerosol, check_client, client_parameters, phase_ratio
 from .shaders import glsl, hlsl
@@ -72,10 +74,11 @@ def make(
     sky = Sky(air, options.orders, options.tolerance)
     clock.stage("solve")
     progress(0.2)
-    if options.texels == "fitted":
-        tables = fitted(client_tables(sky, colours, one, mu_s_min, dense_size(size)))
-    else:
+    if options.texels == "exact":
         tables = client_tables(sky, colours, one, mu_s_min, size)
+    else:
+        to = Bruneton(air.bottom_radius_m, air.top_radius_m, mu_s_min)
+        tables = fitted(partial(client_tables, sky, colours, one, mu_s_min), to, size)
     clock.stage("bake")
     progress(0.6)
     parameters = client_parameters(air, colours, mu_s_min, one.g)
@@ -137,7 +140,7 @@ def _metadata(
         "units": "cd m^-2 and lux" if layout == "cosmoscout" else "W m^-2 nm^-1, per sr where it is radiance",
         **described(colours, air),
         "muSMin": mu_s_min,
-        "texels": options.texels or "exact",
+        "texels": options.texels or "fitted",
         "holds": roles,
         "tolerance": options.tolerance,
         "orders": options.orders or "all",

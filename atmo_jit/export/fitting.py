@@ -1,37 +1,67 @@
 """Texels that err least between them, in place of texels that are right where they stand.
 
 Clients read linearly between 32 suns. At twilight light falls by a factor of three from one to the next, and the
-straight line lies above what happens between. Fitted texels minimise the squared relative error over the suns between
-the nodes; at the nodes themselves the light is then wrong, by up to two thirds of what it was between them.
+straight line lies above what happens between; about noon the suns are far apart. Fitted texels minimise the squared
+relative error over the suns between the nodes; at the nodes themselves the light is then wrong, by up to two thirds of
+what it was between them. Only the table of all light but single Mie scattering is fitted, and what that changes counts
+as light of orders >= 2: single scattering is exact in files of either kind.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from ..mapping import Bruneton, texels
 from .lookup import ClientTables
 
-BETWEEN = 4  # parts of an interval at which the light is known
+STRAIGHT = (0.05, 0.4)  # cosines of suns between which a line between texels errs by less than 0.1 %
 FAINTEST = 1e-6  # of a column's brightest: relative errors of less light do not count
 
 
-def dense_size(size: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """``size`` with the suns that a fit needs."""
-    return (*size[:3], (size[3] - 1) * BETWEEN + 1)
+def fitted(
+    make: Callable[[tuple[int, int, int, int], Any], ClientTables], to: Bruneton, size: tuple[int, int, int, int]
+) -> ClientTables:
+    """The tables of ``size`` that err least; ``make(size, block)`` computes a block of those of a size."""
+    half_way = 0.5 * (texels(size[3])[1:] + texels(size[3])[:-1])
+    curved = np.flatnonzero((to.sun_inverse(half_way) < STRAIGHT[0]) | (to.sun_inverse(half_way) > STRAIGHT[1]))
+    suns = np.sort(np.concatenate([2 * np.arange(size[3]), 2 * curved + 1]))
+    found = make((*size[:3], 2 * size[3] - 1), (slice(None), suns))
+    node = suns % 2 == 0
+    single = found.scattering[..., node, :] - found.higher[..., node, :]
+    higher = np.maximum(fitted_suns(found.scattering, suns) - single, 0.0)
+    return replace(found, scattering=single + higher, single_mie=found.single_mie[..., node, :], higher=higher)
 
 
-def fitted(dense: ClientTables) -> ClientTables:
-    """The tables of the clients' suns from tables with BETWEEN times as many."""
-    names = ("scattering", "single_mie", "higher")
-    return replace(dense, **{name: fitted_suns(getattr(dense, name)) for name in names})
-
-
-def fitted_suns(values: np.ndarray, between: int = BETWEEN) -> np.ndarray:
+def fitted_suns(values: np.ndarray, suns: np.ndarray | None = None) -> np.ndarray:
     """Nodes [A, ..., n, C] of the piecewise linear function of the last axis but one that has the least sum of squared
-    relative errors at ``values`` [A, ..., (n - 1) between + 1, C]; none is negative."""
-    return np.stack([_fitted(part, between) for part in values])
+    relative errors; none is negative. ``values`` [A, ..., S, C]: the light at ``suns`` [S], all even places from 0 to
+    2 n - 2 (the nodes) and some odd ones (half-way between); default: all."""
+    suns = np.arange(values.shape[-2]) if suns is None else suns
+    return np.stack([_fitted(_finer(part, suns), 4) for part in values])
+
+
+def _finer(values: np.ndarray, suns: np.ndarray) -> np.ndarray:
+    """Light [..., S, C] at four times as many suns as there are nodes: on straight lines where it is known at the nodes
+    alone, else on cubics of its logarithm."""
+    most = np.maximum(values.max(axis=-2, keepdims=True), 1e-30)
+    known = np.log(np.maximum(values, FAINTEST**2 * most))
+    half = np.empty((*values.shape[:-2], int(suns[-1]) + 1, values.shape[-1]), dtype=values.dtype)
+    half[..., suns, :] = known
+    missing = np.setdiff1d(np.arange(half.shape[-2]), suns)
+    half[..., missing, :] = np.log(0.5 * (np.exp(half[..., missing - 1, :]) + np.exp(half[..., missing + 1, :])))
+    out = np.empty((*values.shape[:-2], 2 * int(suns[-1]) + 1, values.shape[-1]), dtype=values.dtype)
+    out[..., ::2, :] = half
+    middle = out[..., 1::2, :]
+    middle[...] = 0.5 * (half[..., 1:, :] + half[..., :-1, :])
+    middle[..., 1:-1, :] += 0.0625 * (
+        half[..., 1:-2, :] + half[..., 2:-1, :] - half[..., :-3, :] - half[..., 3:, :]
+    )
+    light = np.exp(out)
+    return np.where(light > 2.0 * FAINTEST**2 * most, light, 0.0)
 
 
 def _fitted(values: np.ndarray, between: int) -> np.ndarray:

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from atmo_jit.bake.client import SCATTERING
+from atmo_jit.bake.client import SCATTERING, bruneton_tables, scattering_nodes
 from atmo_jit.cli import main
 from atmo_jit.errors import InputError
 from atmo_jit.export import Options, export, read
@@ -75,6 +75,19 @@ def test_takram_comes_back(takram, earth_sky):
     assert np.all(tables.rays(4e5, 0.5, np.pi - 0.3, 0.0) > 0.0) and not tables.rays(4e5, 0.5, 1.0, 0.0).any()
 
 
+def test_fitted_files_hold_exact_single_scattering(takram, earth_sky):
+    """What the fit changes counts as light of higher orders, in half precision."""
+    tables, exact = read(takram.folder), bruneton_tables(earth_sky)
+    single = tables.scattering - tables.higher
+    lit = exact.rayleigh > 1e-6 * exact.rayleigh.max()
+    digits = 1e-3 * tables.scattering + 6e-8  # two roundings, and the step of the smallest halves
+    assert np.percentile((np.abs(single - exact.rayleigh) / (3e-3 * exact.rayleigh + digits))[lit], 99) < 1.0
+    lit = exact.mie > 1e-4 * exact.mie.max()
+    assert np.percentile(np.abs(tables.single_mie - exact.mie)[lit] / exact.mie[lit], 99) < 3e-3
+    assert not np.allclose(tables.scattering, exact.scattering, rtol=0.05)
+    assert tables.higher.min() >= 0.0
+
+
 def test_bruneton_comes_back_exactly(tmp_path):
     report = export("earth", "bruneton", tmp_path, SMALL)
     tables = read(tmp_path)
@@ -114,7 +127,6 @@ def test_an_aerosol_that_clients_do_not_have_keeps_its_radiance(earth, tmp_path)
     assert any("2 species" in w for w in report.warnings)
     tables = read(tmp_path)
     from atmo_jit.backend import doubles
-    from atmo_jit.bake.client import scattering_nodes
     from atmo_jit.sky import Sky
 
     h, mu, mu_s, nu = scattering_nodes(tables.mapping, (8, 32, 8, 16))
