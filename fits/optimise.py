@@ -1,7 +1,7 @@
 """Minimising a sum of squares with jaxopt, which stays behind this module.
 
 Levenberg-Marquardt with Gauss-Newton's Hessian, and L-BFGS-B on the sum itself. The functions that are minimised run
-on the host (they call Dr.Jit), so jaxopt runs without jit, one step at a time: that gives progress, and reasons.
+on the host (they call Dr.Jit), so jaxopt runs one step at a time: that gives progress, and reasons.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ STEP_TOLERANCE = 0.1
 LEAST_GAIN = 0.1
 FAR = 1e6
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
+DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
 
@@ -89,6 +91,16 @@ class Residuals:
         """The Jacobian that was asked for last."""
         return self._last[1]
 
+    def small(self, u: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals [P + 1] and Jacobian [P + 1, P] with the same products with themselves and each other: the
+        triangle of the QR decomposition of both, side by side."""
+        both = np.column_stack([self.jacobian(u), self.residual(u)])
+        size = both.shape[1]
+        triangle = np.zeros((size, size))
+        found = np.linalg.qr(both, mode="r")
+        triangle[: len(found)] = found
+        return triangle[:, -1].copy(), triangle[:, :-1].copy()
+
     def cost(self, u: Any) -> float:
         """Half the sum of squares at u."""
         r = self.residual(u)
@@ -122,56 +134,120 @@ def minimise(
         return run(functions, np.asarray(start, float), max_iterations, step_tolerance, progress or (lambda *_: None))
 
 
+class _Steps:
+    """Levenberg-Marquardt's steps for P unknowns: Madsen & Nielsen, Introduction to Optimization and Data Fitting
+    (2010), algorithm 6.18, as jaxopt has it; compiled once.
+
+    The sum of squares and its Gauss-Newton model depend on the residuals and their Jacobian by ``Residuals.small`` only,
+    P + 1 rows whatever the number of samples, so that one compiled step serves all data.
+    """
+
+    def __init__(self, size: int) -> None:
+        jax, jaxopt = _jaxopt()
+        import jax.numpy as jnp
+
+        self.functions: Residuals | None = None
+        self._error: BaseException | None = None
+        shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((size + 1,), (size + 1, size))]
+
+        @jax.custom_jvp
+        def residual(u: Any) -> Any:
+            return jax.pure_callback(lambda u: self._on_host(0, u), shapes[0], u)
+
+        @residual.defjvp
+        def along(primals: Any, tangents: Any) -> Any:
+            (u,), (tangent,) = primals, tangents
+            return residual(u), jax.pure_callback(lambda u: self._on_host(1, u), shapes[1], u) @ tangent
+
+        self._shapes = shapes
+        self._solver = jaxopt.LevenbergMarquardt(
+            residual, materialize_jac=True, solver="cholesky", jit=True, implicit_diff=False
+        )
+        self._state_type = type(jax.eval_shape(self._solver.init_state, jnp.zeros(size)))
+
+    def _on_host(self, which: int, u: Any) -> np.ndarray:
+        """Small residuals (0) or Jacobian (1); JAX would hide an error that passed through it."""
+        try:
+            return self._functions_at(np.array(u, dtype=float))[which]
+        except BaseException as error:  # noqa: BLE001 - raised again by __call__
+            self._error = error
+            return np.full(self._shapes[which].shape, np.nan)
+
+    def _functions_at(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        functions = self.functions
+        if functions.cost(u) > self.best * (1.0 + 1e-9):
+            # jaxopt asks for the Jacobian of steps that it then rejects, and multiplies it by zero.
+            size = self._shapes[1].shape
+            return np.append(np.zeros(size[1]), np.sqrt(2.0 * functions.cost(u))), np.zeros(size)
+        return functions.small(u)
+
+    def start(self, functions: Residuals, u: np.ndarray) -> Any:
+        """The state at ``u``."""
+        self.functions, self.best = functions, functions.cost(u)
+        residual, jacobian = functions.small(u)
+        gradient, squares = jacobian.T @ residual, jacobian.T @ jacobian
+        return self._state_type(
+            iter_num=np.asarray(0),
+            damping_factor=DAMPING * np.diag(squares).max(),
+            increase_factor=np.asarray(2.0),
+            error=np.linalg.norm(gradient),
+            residual=residual,
+            value=np.asarray(self.best),
+            delta=np.zeros_like(u),
+            gradient=gradient,
+            jac=jacobian,
+            jt=jacobian.T.copy(),
+            jtj=squares,
+            hess_res=None,
+            aux=None,
+        )
+
+    def __call__(self, u: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
+        """The point and the state after a step."""
+        jax, _ = _jaxopt()
+        u, state = jax.tree.map(np.asarray, tuple(self._solver.update(u, state)))
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        return u, state
+
+
+_steps_for = lru_cache(maxsize=16)(_Steps)
+
+
 def _levenberg_marquardt(
     functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
 ) -> Solution:
-    """Madsen & Nielsen, Introduction to Optimization and Data Fitting (2010), algorithm 6.18, as jaxopt has it."""
-    jax, jaxopt = _jaxopt()
-    import jax.numpy as jnp
-
-    best = functions.cost(start)
-
-    @jax.custom_jvp
-    def residual(u: Any) -> Any:
-        return jnp.asarray(functions.residual(u))
-
-    @residual.defjvp
-    def along(primals: Any, tangents: Any) -> Any:
-        (u,), (tangent,) = primals, tangents
-        # jaxopt asks for the Jacobian of steps that it then rejects, and multiplies it by zero.
-        rejected = functions.cost(u) > best * (1.0 + 1e-9)
-        jacobian = np.zeros((len(functions.residual(u)), len(start))) if rejected else functions.jacobian(u)
-        return residual(u), jnp.asarray(jacobian) @ tangent
+    """Steps of :class:`_Steps` until they gain nothing."""
+    steps, u = _steps_for(len(start)), start
+    functions.renewed(start)
+    state = steps.start(functions, start)
+    best = steps.best
 
     def done(u: Any, iterations: int, converged: bool, reason: str) -> Solution:
         return Solution(np.array(u), best, iterations, converged, reason, functions.last_jacobian)
 
-    solver = jaxopt.LevenbergMarquardt(
-        residual, materialize_jac=True, solver="cholesky", jit=False, implicit_diff=False, damping_parameter=1e-4
-    )
-    u = jnp.asarray(start)
-    functions.renewed(start)
-    state = solver.init_state(u)
     failures = 0
     for iteration in range(1, max_iterations + 1):
-        u_next, state = solver.update(u, state)
-        step, now = np.asarray(state.delta), functions.cost(u_next)
+        u_next, state = steps(u, state)
+        step, now = state.delta, functions.cost(u + state.delta)
         if not np.all(np.isfinite(step)):
             return done(u, iteration, False, "the data do not depend on a parameter: no step exists")
         progress(iteration, min(now, best))
         gain = best - now
         if gain > 0.0:
-            best, u, failures = now, u_next, 0
+            best = steps.best = now
+            u, failures = u_next, 0
             if gain < 0.5 * len(start) * enough**2:
                 return done(u, iteration, True, f"steps no longer gain {enough:g} standard errors")
             continue
         failures += 1
         # What the step promised; the cost's own rounding may hide less than a small part of a standard error.
-        promised = -0.5 * float(step @ np.asarray(state.gradient))
+        promised = -0.5 * float(step @ state.gradient)
         small = promised < 0.5 * len(start) * max(enough, LEAST_GAIN) ** 2
         if not functions.exact:
             functions.renewed(u)
-            state = solver.init_state(u)
+            state = steps.start(functions, u)
         elif small or failures > 5:
             reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
             return done(u, iteration, small, reason)
