@@ -138,8 +138,8 @@ class _Steps:
     """Levenberg-Marquardt's steps for P unknowns: Madsen & Nielsen, Introduction to Optimization and Data Fitting
     (2010), algorithm 6.18, as jaxopt has it; compiled once.
 
-    The sum of squares and its Gauss-Newton model depend on the residuals and their Jacobian by ``Residuals.small`` only,
-    P + 1 rows whatever the number of samples, so that one compiled step serves all data.
+    The sum of squares and its Gauss-Newton model depend on residuals and Jacobian by ``Residuals.small`` only, P + 1
+    rows whatever the number of samples, so that one compiled step serves all data.
     """
 
     def __init__(self, size: int) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -180,13 +181,11 @@ class Problem:
                 change = factor * self._mixed(by_leaf[leaf.name] * spread)
                 columns[:, first + k] = (scale * change)[self._used]
             first += len(leaf.scalars)
-        turned: dict[str, np.ndarray] = {}
+        turned = self._turned(values, sun_zenith, azimuth)
         for i, nuisance in enumerate(self._nuisances, first):
             if nuisance.kind.endswith("calibration"):
                 change = predicted / v[i]
             else:
-                if nuisance.kind not in turned:
-                    turned[nuisance.kind] = self._turned(nuisance.kind, values, sun_zenith, azimuth)
                 change = factor * self._mixed(turned[nuisance.kind])
             columns[:, i] = np.where(nuisance.applies, scale * change, 0.0)[self._used]
         return columns * slopes
@@ -220,15 +219,17 @@ class Problem:
         over = zenith < 0.0  # past the zenith: the same direction from the other side
         return factor, np.clip(np.abs(zenith), 0.0, np.pi), np.where(over, azimuth + np.pi, azimuth)
 
-    def _turned(self, kind: str, values: dict[str, Any], zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        """Derivative [N, W] of radiance by a turn of the sun, per degree."""
-        ends = []
-        for sign in (1.0, -1.0):
-            if kind == "sun_zenith":
-                ends.append(self.model.radiance(values, np.abs(zenith + sign * TURN), azimuth, rough=True))
-            else:
-                ends.append(self.model.radiance(values, zenith, azimuth - sign * TURN, rough=True))
-        return (ends[0] - ends[1]) / (2.0 * np.degrees(TURN))
+    def _turned(self, values: dict[str, Any], zenith: np.ndarray, azimuth: np.ndarray) -> dict[str, np.ndarray]:
+        """Derivatives [N, W] of radiance by turns of the sun, per degree, by kind."""
+        kinds = sorted({n.kind for n in self._nuisances if not n.kind.endswith("calibration")})
+        turns = []
+        for kind, sign in product(kinds, (1.0, -1.0)):
+            by = (sign * TURN, 0.0) if kind == "sun_zenith" else (0.0, sign * TURN)
+            turns.append((np.abs(zenith + by[0]), azimuth - by[1]))
+        ends = self.model.turned(values, turns) if turns else []
+        return {
+            kind: (ends[2 * i] - ends[2 * i + 1]) / (2.0 * np.degrees(TURN)) for i, kind in enumerate(kinds)
+        }
 
     def _mixed(self, light: np.ndarray) -> np.ndarray:
         return light if self.data.mixing is None else light @ self.data.mixing.T
