@@ -26,8 +26,8 @@ COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
 @dataclass(frozen=True)
 class Solution:
-    """Where a minimisation ended: ``u`` [P], half the sum of squares ``cost``, ``iterations``, whether it
-    ``converged``, the ``reason`` it stopped for, and the last ``jacobian`` [M, P], which is that of a point within a
+    """Where a minimisation ended: ``u`` [P], the sum of the loss ``cost``, ``iterations``, whether it ``converged``,
+    the ``reason`` it stopped for, and the last ``jacobian`` [M, P], which is that of a point within a
     step of it."""
 
     u: np.ndarray
@@ -39,18 +39,24 @@ class Solution:
 
 
 class Residuals:
-    """Residuals [M] and their Jacobian [M, P] as functions on the host.
+    """Residuals [M] and their Jacobian [M, P] as functions on the host, and the ``loss`` whose sum is minimised: of M
+    residuals, with its slope and curvature.
 
     A Jacobian costs many times what residuals cost, so along a path of small steps it is not computed again but
-    corrected by what the step has shown (Broyden 1965), as long as it had foreseen most of that.
+    corrected by what the step has shown (Broyden 1965), as long as it had foreseen most of that. ``known``: a point and
+    the Jacobian there or close by.
     """
 
     def __init__(
-        self, residual: Callable[[np.ndarray], np.ndarray], jacobian: Callable[[np.ndarray], np.ndarray]
+        self,
+        residual: Callable[[np.ndarray], np.ndarray],
+        jacobian: Callable[[np.ndarray], np.ndarray],
+        loss: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]],
+        known: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        self._residual, self._jacobian = residual, jacobian
+        self._residual, self._jacobian, self._loss = residual, jacobian, loss
         self._kept: dict[bytes, np.ndarray] = {}
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._last = known
         self.exact = False
 
     def residual(self, u: Any) -> np.ndarray:
@@ -91,20 +97,29 @@ class Residuals:
         """The Jacobian that was asked for last."""
         return self._last[1]
 
-    def small(self, u: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals [P + 1] and Jacobian [P + 1, P] with the same products with themselves and each other: the
-        triangle of the QR decomposition of both, side by side."""
-        both = np.column_stack([self.jacobian(u), self.residual(u)])
-        size = both.shape[1]
-        triangle = np.zeros((size, size))
-        found = np.linalg.qr(both, mode="r")
-        triangle[: len(found)] = found
-        return triangle[:, -1].copy(), triangle[:, :-1].copy()
-
     def cost(self, u: Any) -> float:
-        """Half the sum of squares at u."""
-        r = self.residual(u)
-        return 0.5 * float(r @ r)
+        """Sum of the loss at u."""
+        return float(np.sum(self._loss(self.residual(u))[0]))
+
+    def gradient(self, u: Any) -> np.ndarray:
+        """Its derivatives [P]."""
+        return self.jacobian(u).T @ self._loss(self.residual(u))[1]
+
+    def small(self, u: Any, more: float) -> tuple[np.ndarray, np.ndarray]:
+        """P + 1 residuals and their Jacobian [P + 1, P] whose least squares have the cost of all, and ``more``, its
+        gradient and, by the curvature of the loss, its Hessian: by the QR decomposition of both side by side.
+
+        ``more`` has to be at least the cost: slope^2 / curvature is up to four times a robust loss.
+        """
+        _, slope, curvature = self._loss(self.residual(u))
+        root = np.sqrt(curvature)
+        size = len(u)
+        triangle = np.zeros((size, size + 1))
+        found = np.linalg.qr(np.column_stack([root[:, None] * self.jacobian(u), slope / root]), mode="r")[:size]
+        triangle[: len(found)] = found
+        jacobian, residual = triangle[:, :size], triangle[:, size]
+        rest = np.sqrt(max(2.0 * (self.cost(u) + more) - float(residual @ residual), 0.0))
+        return np.append(residual, rest), np.vstack([jacobian, np.zeros(size)])
 
 
 def _jaxopt() -> tuple[Any, Any]:
@@ -125,7 +140,7 @@ def minimise(
     step_tolerance: float = STEP_TOLERANCE,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise half the sum of squares from ``start``. ``step_tolerance``: a step that gains less than this part of the
+    """Minimise the sum of the loss from ``start``. ``step_tolerance``: a step that gains less than this part of the
     standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration and cost.
     """
     run = {"levenberg_marquardt": _levenberg_marquardt, "lbfgsb": _lbfgsb}[method]
@@ -138,8 +153,7 @@ class _Steps:
     """Levenberg-Marquardt's steps for P unknowns: Madsen & Nielsen, Introduction to Optimization and Data Fitting
     (2010), algorithm 6.18, as jaxopt has it; compiled once.
 
-    The sum of squares and its Gauss-Newton model depend on residuals and Jacobian by ``Residuals.small`` only, P + 1
-    rows whatever the number of samples, so that one compiled step serves all data.
+    It sees ``Residuals.small``, P + 1 rows whatever the number of samples, so that one compiled step serves all data.
     """
 
     def __init__(self, size: int) -> None:
@@ -147,6 +161,7 @@ class _Steps:
         import jax.numpy as jnp
 
         self.functions: Residuals | None = None
+        self.best = self._more = 0.0
         self._error: BaseException | None = None
         shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((size + 1,), (size + 1, size))]
 
@@ -178,13 +193,14 @@ class _Steps:
         if functions.cost(u) > self.best * (1.0 + 1e-9):
             # jaxopt asks for the Jacobian of steps that it then rejects, and multiplies it by zero.
             size = self._shapes[1].shape
-            return np.append(np.zeros(size[1]), np.sqrt(2.0 * functions.cost(u))), np.zeros(size)
-        return functions.small(u)
+            return np.append(np.zeros(size[1]), np.sqrt(2.0 * (functions.cost(u) + self._more))), np.zeros(size)
+        return functions.small(u, self._more)
 
     def start(self, functions: Residuals, u: np.ndarray) -> Any:
         """The state at ``u``."""
         self.functions, self.best = functions, functions.cost(u)
-        residual, jacobian = functions.small(u)
+        self._more = self.best
+        residual, jacobian = functions.small(u, self._more)
         gradient, squares = jacobian.T @ residual, jacobian.T @ jacobian
         return self._state_type(
             iter_num=np.asarray(0),
@@ -192,7 +208,7 @@ class _Steps:
             increase_factor=np.asarray(2.0),
             error=np.linalg.norm(gradient),
             residual=residual,
-            value=np.asarray(self.best),
+            value=np.asarray(self.best + self._more),
             delta=np.zeros_like(u),
             gradient=gradient,
             jac=jacobian,
@@ -220,7 +236,6 @@ def _levenberg_marquardt(
 ) -> Solution:
     """Steps of :class:`_Steps` until they gain nothing."""
     steps, u = _steps_for(len(start)), start
-    functions.renewed(start)
     state = steps.start(functions, start)
     best = steps.best
 
@@ -257,13 +272,12 @@ def _levenberg_marquardt(
 def _lbfgsb(
     functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
 ) -> Solution:
-    """L-BFGS-B (Byrd et al. 1995), as jaxopt has it, on half the sum of squares."""
+    """L-BFGS-B (Byrd et al. 1995), as jaxopt has it, on the sum itself."""
     _, jaxopt = _jaxopt()
     import jax.numpy as jnp
 
     def both(u: Any, *_: Any, **__: Any) -> tuple[Any, Any]:
-        r = functions.residual(u)
-        return jnp.asarray(0.5 * float(r @ r)), jnp.asarray(functions.jacobian(u).T @ r)
+        return jnp.asarray(functions.cost(u)), jnp.asarray(functions.gradient(u))
 
     solver = jaxopt.LBFGSB(both, value_and_grad=True, jit=False, implicit_diff=False, maxiter=max_iterations)
     bounds = (jnp.full(start.shape, -30.0), jnp.full(start.shape, 30.0))
