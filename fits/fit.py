@@ -28,7 +28,9 @@ from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minim
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 
-FEW = 300  # samples (directions) that the first steps look at
+FEW = 128  # samples (directions) that the first steps look at, or
+FEW_EACH = 32  # of each scan, or
+FEW_FOLD = 8  # as many times the unknowns, whichever is most
 UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
@@ -234,7 +236,8 @@ def _starting_points(whole: Problem) -> list[np.ndarray]:
 
 def _few(whole: Problem) -> Problem:
     """The problem for some directions, and as many wavelengths as are solved at once."""
-    rows, count = _some(whole.data, FEW), len(whole.data.wavelengths_nm)
+    rows = _some(whole.data, max(FEW, FEW_EACH * whole.data.scans, FEW_FOLD * len(whole.scalars)))
+    count = len(whole.data.wavelengths_nm)
     if whole.data.mixing is not None or count <= MAX_CHANNELS:
         return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
     order = np.argsort(whole.data.wavelengths_nm)

@@ -59,6 +59,7 @@ class SkyModel:
         self.layout_number = 0
         self._resolution, self._rough = Resolution(), Resolution()
         self._lights: dict[Any, RayLight] = {}
+        self._skies: dict[Any, Sky] = {}
 
     def at(
         self, data: Observations, atmosphere: Atmosphere | None = None, tolerance: float | None = None
@@ -78,6 +79,7 @@ class SkyModel:
         self._rough = Resolution.suited(self._layout, max(self.tolerance, ROUGH))
         self.layout_number += 1
         self._lights.clear()
+        self._skies.clear()
 
     def strays(self, values: Values) -> bool:
         """Whether the nodes in use were placed for much thinner or thicker air."""
@@ -129,14 +131,17 @@ class SkyModel:
         size = np.maximum(np.abs(value), SMALLEST.get(last, 1e-9)) * STEP
         return np.where(np.asarray(value) > 0.5, -size, size) if last in SMALLEST else size
 
+    def _channels(self, sets: int) -> np.ndarray:
+        """Which of the wavelengths of several atmospheres stand side by side."""
+        total = sets * len(self.atmosphere.wavelengths_nm)
+        return np.minimum(np.arange(-(-total // MAX_CHANNELS) * MAX_CHANNELS), total - 1)
+
     def _spread(self, several: list[Values]) -> Atmosphere:
         """One atmosphere with the wavelengths of several, one after the other, and as many of the last again as fill
         the bands, so that all bands run the same kernels."""
         base = self.atmosphere
         airs = [base.replace(values) for values in several]
-        total = len(airs) * len(base.wavelengths_nm)
-        size = -(-total // MAX_CHANNELS) * MAX_CHANNELS
-        index = np.minimum(np.arange(size), total - 1)
+        index = self._channels(len(airs))
         document = airs[0].to_dict()
 
         def gathered(read: Any) -> list[float]:
@@ -180,11 +185,19 @@ class SkyModel:
         else:
             key = len(several), resolution, copies, _suns(sun_zenith)
             if key not in self._lights:
-                base = {name: self._layout.get(name) for name in values}
-                sky = self._solved(self._spread([base] * len(several)), self._layout, resolution, sun_zenith)
-                self._lights[key] = RayLight(sky, *views)
+                sky = self._sky(resolution, sun_zenith)
+                channels = self._channels(len(several)) % len(self.atmosphere.wavelengths_nm)
+                self._lights[key] = RayLight(sky, air, channels, *views)
             light = self._lights[key](air, sun_zenith, azimuth)
         return light[:, : len(several) * len(self.atmosphere.wavelengths_nm)]
+
+    def _sky(self, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
+        """The sky of the atmosphere that the nodes were placed for."""
+        key = resolution, _suns(sun_zenith)
+        if key not in self._skies:
+            base = self._spread([{name: self._layout.get(name) for name in self.spectral}])
+            self._skies[key] = self._solved(base, self._layout, resolution, sun_zenith)
+        return self._skies[key]
 
     def _solved(self, air: Atmosphere, layout: Atmosphere, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
         tolerance = self.tolerance if resolution == self._resolution else ROUGH
