@@ -177,6 +177,7 @@ class SkyModel:
         resolution = self._rough if rough else self._resolution
         air = self._spread(several)
         views = [np.tile(v, copies) for v in (self.altitude_m, self.view_zenith)]
+        count = len(several) * len(self.atmosphere.wavelengths_nm)
         if self.others:  # other profiles, other geometry: nothing of which could be recorded
             layout = self._layout.replace({name: values[name] for name in self.others})
             sky = self._solved(air, layout, resolution, sun_zenith)
@@ -187,9 +188,9 @@ class SkyModel:
             if key not in self._lights:
                 sky = self._sky(resolution, sun_zenith)
                 channels = self._channels(len(several)) % len(self.atmosphere.wavelengths_nm)
-                self._lights[key] = RayLight(sky, air, channels, *views)
+                self._lights[key] = RayLight(sky, air, channels, *views, sun_zenith, azimuth)
             light = self._lights[key](air, sun_zenith, azimuth)
-        return light[:, : len(several) * len(self.atmosphere.wavelengths_nm)]
+        return light[:, :count]
 
     def _sky(self, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
         """The sky of the atmosphere that the nodes were placed for."""

@@ -25,7 +25,7 @@ class RayLight:
     profiles and kinds of particles, optical depths within a factor of two.
 
     ``side_by_side``: an atmosphere with wavelength ``channels`` [C] of that of ``sky`` at its C wavelengths.
-    ``altitude_m``, ``view_zenith`` [N], radians.
+    ``altitude_m``, ``view_zenith`` [N], radians; ``sun_zenith`` and ``azimuth`` [N]: where the sun is first looked for.
     """
 
     def __init__(
@@ -35,13 +35,16 @@ class RayLight:
         channels: np.ndarray,
         altitude_m: np.ndarray,
         view_zenith: np.ndarray,
+        sun_zenith: np.ndarray,
+        azimuth: np.ndarray,
     ) -> None:
-        self._place, self._resolution = (doubles(altitude_m), doubles(view_zenith)), sky.resolution
+        self._resolution, self._rays = sky.resolution, (altitude_m, sun_zenith, view_zenith, azimuth)
+        self._one_of, self._which = _distinct(*self._rays)
         self._shares = _shares(sky, channels)
         kinds = [band.optics.phase_kinds for band in sky.solutions]
         make_up = sky.solutions[0].optics.make_up
         self._recorded = None not in kinds
-        grid, key = sky.grid, (len(channels), len(altitude_m), len(self._shares[0]), make_up, kinds[0])
+        grid, key = sky.grid, (len(channels), len(self._shares[0]), make_up, kinds[0])
         grid.kept("shells of fits", lambda: _shells(sky))
 
         def made() -> Any:
@@ -56,9 +59,28 @@ class RayLight:
         from it."""
         degrees = self._resolution.degrees, self._resolution.phase_degree
         values = [on_device(optics.numbers(air, *degrees)) for optics in self._optics]
-        arguments = values, self._shares, [self._place[0], doubles(sun_zenith), self._place[1], doubles(azimuth)]
-        light = self._recordings.run("light", self._light, *arguments) if self._recorded else self._light(*arguments)
-        return np.stack([v.numpy() for v in light], axis=-1).astype(float)
+        altitude_m, first_sun, view_zenith, first_azimuth = self._rays
+        views, which = (altitude_m, sun_zenith, view_zenith, azimuth), slice(None)
+        if np.array_equal(sun_zenith, first_sun) and np.array_equal(azimuth, first_azimuth):
+            views, which = [v[self._one_of] for v in views], self._which
+        arguments = values, self._shares, [doubles(v) for v in views]
+        # Of other numbers of rays there are other recordings.
+        run = self._recordings.run if self._recorded else lambda _, light, *arguments: light(*arguments)
+        light = run(len(views[0]), self._light, *arguments)
+        return np.stack([v.numpy() for v in light], axis=-1).astype(float)[which]
+
+
+def _distinct(
+    altitude_m: np.ndarray, sun_zenith: np.ndarray, view_zenith: np.ndarray, azimuth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that see different skies, and which of them is every ray: the sky is the same on both sides of the sun."""
+    turn = np.abs((azimuth + np.pi) % (2.0 * np.pi) - np.pi)
+    rays = np.round(np.column_stack([altitude_m, sun_zenith, view_zenith, turn]), 9)
+    order = np.lexsort(rays.T)
+    new = np.append(True, np.any(np.diff(rays[order], axis=0) != 0.0, axis=1))
+    which = np.empty(len(rays), int)
+    which[order] = np.cumsum(new) - 1
+    return order[new], which
 
 
 def _shares(sky: Sky, channels: np.ndarray) -> list[Any]:

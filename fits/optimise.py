@@ -19,6 +19,8 @@ MAX_ITERATIONS = 60
 STEP_TOLERANCE = 0.1
 LEAST_GAIN = 0.1
 FAR = 1e6
+FAILURES = 6  # steps, each shorter than the one before, that may raise the cost
+TRUSTED = 2  # corrections of a Jacobian that is still believed where it says that nothing is left to gain
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
 DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
@@ -57,7 +59,7 @@ class Residuals:
         self._residual, self._jacobian, self._loss = residual, jacobian, loss
         self._kept: dict[bytes, np.ndarray] = {}
         self._last = known
-        self.exact = False
+        self.corrections = 0
 
     def residual(self, u: Any) -> np.ndarray:
         """[M] at u; kept for the last points."""
@@ -71,7 +73,7 @@ class Residuals:
         return self._kept[key]
 
     def jacobian(self, u: Any) -> np.ndarray:
-        """[M, P] at u: corrected from the last point's, or ``exact``."""
+        """[M, P] at u: corrected from the last point's, or exact."""
         u = np.array(u, dtype=float)
         if self._last is not None:
             before, jacobian = self._last
@@ -82,14 +84,14 @@ class Residuals:
             missed = self.residual(u) - self.residual(before) - foreseen
             if np.linalg.norm(missed) < FORESEEN * np.linalg.norm(foreseen):
                 self._last = u, jacobian + np.outer(missed, step / (step @ step))
-                self.exact = False
+                self.corrections += 1
                 return self._last[1]
         return self.renewed(u)
 
     def renewed(self, u: Any) -> np.ndarray:
         """The exact Jacobian at u."""
         u = np.array(u, dtype=float)
-        self._last, self.exact = (u, np.nan_to_num(self._jacobian(u))), True
+        self._last, self.corrections = (u, np.nan_to_num(self._jacobian(u))), 0
         return self._last[1]
 
     @property
@@ -260,10 +262,10 @@ def _levenberg_marquardt(
         # What the step promised; the cost's own rounding may hide less than a small part of a standard error.
         promised = -0.5 * float(step @ state.gradient)
         small = promised < 0.5 * len(start) * max(enough, LEAST_GAIN) ** 2
-        if not functions.exact:
+        if functions.corrections > (TRUSTED if small else 0):
             functions.renewed(u)
             state = steps.start(functions, u)
-        elif small or failures > 5:
+        elif small or failures > FAILURES:
             reason = "no step lowers the cost" + ("" if small else " although the gradient is not zero")
             return done(u, iteration, small, reason)
     return done(u, max_iterations, False, f"{max_iterations} iterations were not enough")
