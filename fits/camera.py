@@ -16,6 +16,7 @@ import numpy as np
 from atmo_jit.errors import InputError, shown
 
 LOOK_AT = ("origin", "target", "up")
+ALONG = 1e-6  # sine of an angle that is none
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def rotation(look_at: Any) -> np.ndarray:
             raise InputError(f"picture.look_at.{key}: is {shown(look_at[key])}; must be three numbers")
     forward = vectors["target"] - vectors["origin"]
     left = np.cross(vectors["up"], forward)
-    if not np.linalg.norm(left) > 0.0:
+    if not np.linalg.norm(left) > ALONG * np.linalg.norm(vectors["up"]) * np.linalg.norm(forward):
         raise InputError("picture.look_at: looks nowhere, or along up; origin, target and up must span a plane")
     forward, left = (v / np.linalg.norm(v) for v in (forward, left))
     return np.stack([left, np.cross(forward, left), forward], axis=1)
