@@ -38,7 +38,7 @@ RESTARTS = 3
 ROUNDS = 12  # of loss and weights, each of
 FIRST_ITERATIONS = 10
 STEPS_FORESEEN = 3
-ALIKE = 1.4  # ratio of weights within which they are not worth another round
+ALIKE = 1.1  # ratio of weights within which they are not worth another round
 MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
 LEAST_CLUSTERS = 6  # from which a scatter of means is known
 FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
@@ -216,9 +216,18 @@ def _weights(problem: Problem, raw: np.ndarray) -> tuple[float, float]:
 
 
 def _poor(end: _End) -> bool:
-    """Whether the model is far from the data, in sigma and in per cent."""
-    found, data = end.problem.evaluate(end.solution.u), end.problem.data
-    relative = float(np.median(np.abs(found.predicted[data.used] / data.radiance[data.used] - 1.0)))
+    """Whether the model is far from the data, in sigma and in per cent, or not as close as it should be with a value
+    without a prior at its bound: where searches end that went astray."""
+    problem, u = end.problem, end.solution.u
+    found, data = problem.evaluate(u), problem.data
+    stuck = any(
+        s.at_bound(v) and not np.isfinite(s.prior_sigma)
+        for s, v in zip(problem.scalars, problem.values(u), strict=True)
+    )
+    if stuck and _scale(found.raw[data.used]) ** 2 > MODEL_ERRS:
+        return True
+    measured = data.radiance[data.used]
+    relative = float(np.median(np.abs(found.predicted[data.used] - measured) / np.maximum(np.abs(measured), 1e-30)))
     return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
 
 

@@ -22,6 +22,7 @@ FAR = 1e6
 FAILURES = 6  # steps, each shorter than the one before, that may raise the cost
 TRUSTED = 2  # corrections of a Jacobian that is still believed where it says that nothing is left to gain
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
+FARTHEST = 30.0  # u between which L-BFGS-B looks
 DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
@@ -165,18 +166,17 @@ class _Steps:
         self.functions: Residuals | None = None
         self.best = self._more = 0.0
         self._error: BaseException | None = None
-        shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((size + 1,), (size + 1, size))]
+        self._shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in ((size + 1,), (size + 1, size))]
 
         @jax.custom_jvp
         def residual(u: Any) -> Any:
-            return jax.pure_callback(lambda u: self._on_host(0, u), shapes[0], u)
+            return jax.pure_callback(lambda u: self._on_host(0, u), self._shapes[0], u)
 
         @residual.defjvp
         def along(primals: Any, tangents: Any) -> Any:
             (u,), (tangent,) = primals, tangents
-            return residual(u), jax.pure_callback(lambda u: self._on_host(1, u), shapes[1], u) @ tangent
+            return residual(u), jax.pure_callback(lambda u: self._on_host(1, u), self._shapes[1], u) @ tangent
 
-        self._shapes = shapes
         self._solver = jaxopt.LevenbergMarquardt(
             residual, materialize_jac=True, solver="cholesky", jit=True, implicit_diff=False
         )
@@ -185,17 +185,17 @@ class _Steps:
     def _on_host(self, which: int, u: Any) -> np.ndarray:
         """Small residuals (0) or Jacobian (1); JAX would hide an error that passed through it."""
         try:
-            return self._functions_at(np.array(u, dtype=float))[which]
-        except BaseException as error:  # noqa: BLE001 - raised again by __call__
+            return self._small(np.array(u, dtype=float))[which]
+        except BaseException as error:  # raised again by __call__
             self._error = error
             return np.full(self._shapes[which].shape, np.nan)
 
-    def _functions_at(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _small(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         functions = self.functions
         if functions.cost(u) > self.best * (1.0 + 1e-9):
             # jaxopt asks for the Jacobian of steps that it then rejects, and multiplies it by zero.
-            size = self._shapes[1].shape
-            return np.append(np.zeros(size[1]), np.sqrt(2.0 * (functions.cost(u) + self._more))), np.zeros(size)
+            rest = np.sqrt(2.0 * (functions.cost(u) + self._more))
+            return np.append(np.zeros(len(u)), rest), np.zeros((len(u) + 1, len(u)))
         return functions.small(u, self._more)
 
     def start(self, functions: Residuals, u: np.ndarray) -> Any:
@@ -274,29 +274,41 @@ def _levenberg_marquardt(
 def _lbfgsb(
     functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
 ) -> Solution:
-    """L-BFGS-B (Byrd et al. 1995), as jaxopt has it, on the sum itself."""
+    """L-BFGS-B (Byrd et al. 1995) on the sum itself: SciPy's by way of jaxopt, whose own takes a minute to trace."""
     _, jaxopt = _jaxopt()
-    import jax.numpy as jnp
+    ended: list[Any] = []
+    points = [np.asarray(start, float)]
 
-    def both(u: Any, *_: Any, **__: Any) -> tuple[Any, Any]:
-        return jnp.asarray(functions.cost(u)), jnp.asarray(functions.gradient(u))
+    def both(u: Any, *_: Any, **__: Any) -> Any:
+        return functions.cost(u), functions.gradient(u)
 
-    solver = jaxopt.LBFGSB(both, value_and_grad=True, jit=False, implicit_diff=False, maxiter=max_iterations)
-    bounds = (jnp.full(start.shape, -30.0), jnp.full(start.shape, 30.0))
-    u = jnp.asarray(start)
-    state = solver.init_state(u, bounds=bounds)
-    cost = functions.cost(start)
-    for iteration in range(1, max_iterations + 1):
-        u_next, state = solver.update(u, state, bounds=bounds)
-        step = np.asarray(u_next) - np.asarray(u)
-        jacobian = functions.jacobian(u_next)
-        length = float(np.linalg.norm(jacobian @ step) / np.sqrt(len(step)))
-        before, cost, u = cost, functions.cost(u_next), u_next
-        progress(iteration, cost)
-        if length < enough:
-            reason = f"the last step was {length:.1g} standard errors"
-            return Solution(np.array(u), cost, iteration, True, reason, jacobian)
-        if abs(before - cost) <= COST_TOLERANCE * before:
-            return Solution(np.array(u), cost, iteration, True, "the cost no longer changes", jacobian)
-    reason = f"{max_iterations} iterations were not enough"
-    return Solution(np.array(u), cost, max_iterations, False, reason, functions.jacobian(u))
+    def after(u: Any) -> None:
+        points.append(np.array(u, dtype=float))
+        change = functions.cost(points[-2]) - functions.cost(points[-1])
+        progress(len(points) - 1, functions.cost(points[-1]))
+        # How far Newton's step would lead.
+        ahead = functions.small(u, functions.cost(u))[0][:-1]
+        if np.linalg.norm(ahead) < enough * np.sqrt(len(ahead)):
+            ended.append(f"the minimum is less than {enough:g} standard errors away")
+        elif abs(change) <= COST_TOLERANCE * functions.cost(points[-1]):
+            ended.append("the cost no longer changes")
+        if ended:
+            raise StopIteration
+
+    solver = jaxopt.ScipyBoundedMinimize(
+        fun=both,
+        method="L-BFGS-B",
+        value_and_grad=True,
+        jit=False,
+        dtype=np.float64,
+        maxiter=max_iterations,
+        callback=after,
+        implicit_diff_solve=None,
+    )
+    bounds = np.full(start.shape, -FARTHEST), np.full(start.shape, FARTHEST)
+    u, info = solver.run(points[0], bounds=bounds)
+    if not ended and info.success:
+        ended.append("the gradient vanishes")
+    u = points[-1] if ended and len(points) > 1 else np.array(u, dtype=float)
+    reason = ended[0] if ended else f"{max_iterations} iterations were not enough"
+    return Solution(u, functions.cost(u), len(points) - 1, bool(ended), reason, functions.jacobian(u))

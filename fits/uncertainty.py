@@ -43,8 +43,8 @@ def uncertainty(problem: Problem, u: np.ndarray, found: Evaluation) -> Uncertain
     """The uncertainty at ``u``, where ``found`` holds the derivatives of the residuals."""
     scalars = problem.scalars
     slopes = np.array([s.slopes(x) for s, x in zip(scalars, u, strict=True)])
-    dv, dz = slopes[:, 0], slopes[:, 1]
-    by_z = dv / dz
+    dz = np.maximum(np.abs(slopes[:, 1]), 1e-300)  # nothing is left of it at a bound itself
+    by_z = np.array([v if s.logarithmic else 1.0 for s, v in zip(scalars, problem.values(u), strict=True)])
     samples = int(np.count_nonzero(problem.data.used))
     # A sample counts as much as its loss does beside its square: nine tenths of Gaussian noise, little of outliers.
     residuals = problem.residuals(u)
