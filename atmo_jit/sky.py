@@ -26,7 +26,7 @@ from .column import SunColumns, sun_columns
 from .errors import InputError
 from .field import Field
 from .grid import Grid
-from .march import Rays, march, rays_to_boundary
+from .march import Rays, Shells, march, rays_to_boundary
 from .multiple_scattering import solve, solve_again
 from .optics import MAX_CHANNELS, Optics
 from .parameters import check_names
@@ -159,6 +159,7 @@ class Sky:
         ground: bool = True,
         sun_disc: bool = False,
         pieces: list[Pieces | None] | None = None,
+        shells: Shells | None = None,
     ) -> RayLight:
         """Radiance and transmittance of rays.
 
@@ -167,7 +168,8 @@ class Sky:
         ``azimuth`` is the view's minus the sun's. ``distance_m``: stop there (aerial perspective). ``ground=False``
         leaves the ground's own radiance out; ``sun_disc=True`` adds the sun, a uniform disc of the atmosphere's
         ``sun_angular_radius_deg`` (nothing for a point sun). ``pieces``: those of the rays (pieces.Pieces), per band;
-        derivatives then pass through.
+        derivatives then pass through. ``shells``: those of march.march, of an atmosphere close to this one, where they
+        cannot be made because the rays are being recorded.
         """
         given = (altitude_m, sun_zenith, view_zenith, azimuth, *([] if distance_m is None else [distance_m]))
         usual = pieces is None and all(isinstance(v, np.ndarray) and v.ndim == 1 for v in given)
@@ -183,7 +185,7 @@ class Sky:
             optics = band.optics
             band.field.prepare()
             if pieces is None:
-                light = march(optics, band.columns, rays, source=band.source)
+                light = march(optics, band.columns, rays, source=band.source, shells=shells)
             else:
                 light = light_along(optics, band.columns, rays, pieces[i], source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)

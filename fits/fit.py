@@ -28,14 +28,17 @@ from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minim
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 
-FEW = 300  # samples (directions) that the first steps look at
+FEW = 128  # samples (directions) that the first steps look at, or
+FEW_EACH = 32  # of each scan, or
+FEW_FOLD = 8  # as many times the unknowns, whichever is most
 UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 RESTARTS = 3
 ROUNDS = 12  # of loss and weights, each of
-FIRST_ITERATIONS = 4
+FIRST_ITERATIONS = 10
 STEPS_FORESEEN = 3
+ALIKE = 1.1  # ratio of weights within which they are not worth another round
 MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
 LEAST_CLUSTERS = 6  # from which a scatter of means is known
 FIRST_TOLERANCE = 0.5  # standard errors of the few samples within which the first steps end
@@ -131,17 +134,18 @@ class _End:
 
 def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
     """The minimum for some of the samples from one start; with a loss and weights that suit what is left there."""
-    u, before = start, 0.0
+    u, known = start, None
     for _ in range(ROUNDS):
         if few.model.strays(few.atmosphere_values(u)):
             few.model.place(few.atmosphere_values(u))
+            known = None
         problem = _weighed(few, u)
-        solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS)
-        u = solution.u
-        if solution.converged and 0.7 < before / problem.excess < 1.4:
+        solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS, known)
+        u, known = solution.u, (solution.u, solution.jacobian)
+        end = _End(problem, solution)
+        if solution.converged and _alike(_weights(problem, end.left), (problem.huber, problem.excess)):
             break
-        before = problem.excess
-    return _End(problem, solution)
+    return end
 
 
 def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
@@ -153,27 +157,34 @@ def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
 
 
 def _weighed(problem: Problem, u: np.ndarray) -> Problem:
-    """The problem with loss and weights for the residuals that a step from ``u`` will leave.
-
-    Those at u may be far larger; with their weights priors would decide.
-    """
-    raw = problem.evaluate(u).raw[problem.data.used]
-    weighed = problem.with_loss(*_weights(problem, raw))
+    """The problem with a loss for the residuals at ``u``, and weights for those that a step from there will leave: they
+    may be far smaller, and with the weights of those at u priors would decide."""
+    residuals, jacobian = problem.residuals(u), problem.jacobian(u)
+    samples = int(np.count_nonzero(problem.data.used))
+    huber, excess = _weights(problem, residuals[:samples])
     for _ in range(STEPS_FORESEEN):
-        at = weighed.evaluate(u, jacobian=True)
-        step = -np.linalg.lstsq(at.jacobian.T @ at.jacobian, at.jacobian.T @ at.residual, rcond=1e-12)[0]
-        weighed = problem.with_loss(*_weights(problem, raw + problem.raw_jacobian(u) @ step))
-    return weighed
+        _, slope, curvature = problem.with_loss(huber, excess).loss(residuals)
+        hessian = jacobian.T @ (curvature[:, None] * jacobian)
+        step = -np.linalg.lstsq(hessian, jacobian.T @ slope, rcond=1e-12)[0]
+        excess = _weights(problem, (residuals + jacobian @ step)[:samples])[1]
+    return problem.with_loss(huber, excess)
+
+
+def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two losses and weights are close enough to each other to serve for each other."""
+    return all(a == b or 1.0 / ALIKE < a / b < ALIKE for a, b in zip(one, other, strict=True))
 
 
 def _solve(
-    problem: Problem, u: np.ndarray, report: _Report, enough: float, iterations: int = MAX_ITERATIONS
+    problem: Problem,
+    u: np.ndarray,
+    report: _Report,
+    enough: float,
+    iterations: int = MAX_ITERATIONS,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Solution:
-    functions = Residuals(
-        lambda u: problem.evaluate(u).residual, lambda u: problem.evaluate(u, jacobian=True).jacobian
-    )
     return minimise(
-        functions,
+        Residuals(problem.residuals, problem.jacobian, problem.loss, known),
         u,
         method=problem.config.optimiser,
         max_iterations=iterations,
@@ -205,9 +216,18 @@ def _weights(problem: Problem, raw: np.ndarray) -> tuple[float, float]:
 
 
 def _poor(end: _End) -> bool:
-    """Whether the model is far from the data, in sigma and in per cent."""
-    found, data = end.problem.evaluate(end.solution.u), end.problem.data
-    relative = float(np.median(np.abs(found.predicted[data.used] / data.radiance[data.used] - 1.0)))
+    """Whether the model is far from the data, in sigma and in per cent, or not as close as it should be with a value
+    without a prior at its bound: where searches end that went astray."""
+    problem, u = end.problem, end.solution.u
+    found, data = problem.evaluate(u), problem.data
+    stuck = any(
+        s.at_bound(v) and not np.isfinite(s.prior_sigma)
+        for s, v in zip(problem.scalars, problem.values(u), strict=True)
+    )
+    if stuck and _scale(found.raw[data.used]) ** 2 > MODEL_ERRS:
+        return True
+    measured = data.radiance[data.used]
+    relative = float(np.median(np.abs(found.predicted[data.used] - measured) / np.maximum(np.abs(measured), 1e-30)))
     return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
 
 
@@ -225,7 +245,8 @@ def _starting_points(whole: Problem) -> list[np.ndarray]:
 
 def _few(whole: Problem) -> Problem:
     """The problem for some directions, and as many wavelengths as are solved at once."""
-    rows, count = _some(whole.data, FEW), len(whole.data.wavelengths_nm)
+    rows = _some(whole.data, max(FEW, FEW_EACH * whole.data.scans, FEW_FOLD * len(whole.scalars)))
+    count = len(whole.data.wavelengths_nm)
     if whole.data.mixing is not None or count <= MAX_CHANNELS:
         return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
     order = np.argsort(whole.data.wavelengths_nm)

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
@@ -23,6 +22,7 @@ from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.resolution import Resolution, column_of
 from atmo_jit.sky import Sky
 
+from .light import RayLight
 from .observations import Observations
 
 # Steps of differences, relative to the value: long enough for single precision, short enough for curvature (5e-3 of a
@@ -30,7 +30,6 @@ from .observations import Observations
 STEP = 0.005
 SMALLEST = {"ground_albedo": 0.5, "g": 0.5, "single_scattering_albedo": 0.5}  # values below are stepped as these
 SUNS_DEG = 5.0  # suns are solved from and to multiples of this, so that small turns keep the nodes
-KEPT = 4  # skies
 ROUGH = 0.2  # tolerance of the skies that derivatives and first steps are taken from: 0.2 % off, in fact
 FOREIGN = 2.0  # factor of optical depth from which on an atmosphere's nodes are placed anew
 
@@ -59,8 +58,8 @@ class SkyModel:
         self._layout: Atmosphere | None = None
         self.layout_number = 0
         self._resolution, self._rough = Resolution(), Resolution()
-        self._solved: dict[Any, Sky] = {}
-        self._views = (doubles(altitude_m), doubles(view_zenith))
+        self._lights: dict[Any, RayLight] = {}
+        self._skies: dict[Any, Sky] = {}
 
     def at(
         self, data: Observations, atmosphere: Atmosphere | None = None, tolerance: float | None = None
@@ -79,7 +78,8 @@ class SkyModel:
         self._resolution = Resolution.suited(self._layout, self.tolerance)
         self._rough = Resolution.suited(self._layout, max(self.tolerance, ROUGH))
         self.layout_number += 1
-        self._solved.clear()
+        self._lights.clear()
+        self._skies.clear()
 
     def strays(self, values: Values) -> bool:
         """Whether the nodes in use were placed for much thinner or thicker air."""
@@ -117,6 +117,13 @@ class SkyModel:
             found[name] = (ends[0] - ends[1]) / (2.0 * step)
         return found
 
+    def turned(
+        self, values: Values, turns: list[tuple[np.ndarray, np.ndarray]]
+    ) -> list[np.ndarray]:
+        """Radiance [N, W] at the resolution of derivatives under other suns: pairs of zenith angle and azimuth [N]."""
+        zenith, azimuth = (np.concatenate(v) for v in zip(*turns, strict=True))
+        return np.split(self._evaluate([values], values, zenith, azimuth, True, len(turns)), len(turns))
+
     @staticmethod
     def _step(name: str, value: Any) -> np.ndarray:
         """Step [W] or a number: toward the inside of the range for fractions."""
@@ -124,14 +131,17 @@ class SkyModel:
         size = np.maximum(np.abs(value), SMALLEST.get(last, 1e-9)) * STEP
         return np.where(np.asarray(value) > 0.5, -size, size) if last in SMALLEST else size
 
+    def _channels(self, sets: int) -> np.ndarray:
+        """Which of the wavelengths of several atmospheres stand side by side."""
+        total = sets * len(self.atmosphere.wavelengths_nm)
+        return np.minimum(np.arange(-(-total // MAX_CHANNELS) * MAX_CHANNELS), total - 1)
+
     def _spread(self, several: list[Values]) -> Atmosphere:
         """One atmosphere with the wavelengths of several, one after the other, and as many of the last again as fill
         the bands, so that all bands run the same kernels."""
         base = self.atmosphere
         airs = [base.replace(values) for values in several]
-        total = len(airs) * len(base.wavelengths_nm)
-        size = -(-total // MAX_CHANNELS) * MAX_CHANNELS
-        index = np.minimum(np.arange(size), total - 1)
+        index = self._channels(len(airs))
         document = airs[0].to_dict()
 
         def gathered(read: Any) -> list[float]:
@@ -152,31 +162,53 @@ class SkyModel:
         return Atmosphere(document)
 
     def _evaluate(
-        self, several: list[Values], values: Values, sun_zenith: np.ndarray, azimuth: np.ndarray, rough: bool
+        self,
+        several: list[Values],
+        values: Values,
+        sun_zenith: np.ndarray,
+        azimuth: np.ndarray,
+        rough: bool,
+        copies: int = 1,
     ) -> np.ndarray:
-        """Radiance for several sets of values side by side: [N, sets x W]."""
+        """Radiance for several sets of values side by side: [N, sets x W]; of ``copies`` of the rays one after the
+        other."""
         if self._layout is None:
             self.place(values)
-        sky = self._sky(self._spread(several), values, sun_zenith, self._rough if rough else self._resolution)
-        light = sky.rays(self._views[0], doubles(sun_zenith), self._views[1], doubles(azimuth))
-        dr.eval(light.radiance)
-        count, columns = len(self.view_zenith), len(several) * len(self.atmosphere.wavelengths_nm)
-        return np.stack([np.broadcast_to(v.numpy(), count) for v in light.radiance[:columns]], axis=-1).astype(float)
-
-    def _sky(self, air: Atmosphere, values: Values, sun_zenith: np.ndarray, resolution: Resolution) -> Sky:
-        """The solved sky, kept: suns and azimuths change without another solve."""
-        suns = (
-            np.radians(SUNS_DEG) * np.floor(np.degrees(sun_zenith.min()) / SUNS_DEG),
-            np.radians(SUNS_DEG) * np.ceil(np.degrees(sun_zenith.max()) / SUNS_DEG),
-        )
-        key = (hash(air), suns, resolution)
-        if key not in self._solved:
-            while len(self._solved) >= KEPT:
-                self._solved.pop(next(iter(self._solved)))
+        resolution = self._rough if rough else self._resolution
+        air = self._spread(several)
+        views = [np.tile(v, copies) for v in (self.altitude_m, self.view_zenith)]
+        count = len(several) * len(self.atmosphere.wavelengths_nm)
+        if self.others:  # other profiles, other geometry: nothing of which could be recorded
             layout = self._layout.replace({name: values[name] for name in self.others})
-            tolerance = self.tolerance if resolution == self._resolution else ROUGH
-            self._solved[key] = Sky(air, tolerance=tolerance, resolution=resolution, suns=suns, layout=layout)
-        return self._solved[key]
+            sky = self._solved(air, layout, resolution, sun_zenith)
+            rays = sky.rays(*(doubles(v) for v in (views[0], sun_zenith, views[1], azimuth)))
+            light = np.stack([np.broadcast_to(v.numpy(), len(azimuth)) for v in rays.radiance], axis=-1).astype(float)
+        else:
+            key = len(several), resolution, copies, _suns(sun_zenith)
+            if key not in self._lights:
+                sky = self._sky(resolution, sun_zenith)
+                channels = self._channels(len(several)) % len(self.atmosphere.wavelengths_nm)
+                self._lights[key] = RayLight(sky, air, channels, *views, sun_zenith, azimuth)
+            light = self._lights[key](air, sun_zenith, azimuth)
+        return light[:, :count]
+
+    def _sky(self, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
+        """The sky of the atmosphere that the nodes were placed for."""
+        key = resolution, _suns(sun_zenith)
+        if key not in self._skies:
+            base = self._spread([{name: self._layout.get(name) for name in self.spectral}])
+            self._skies[key] = self._solved(base, self._layout, resolution, sun_zenith)
+        return self._skies[key]
+
+    def _solved(self, air: Atmosphere, layout: Atmosphere, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
+        tolerance = self.tolerance if resolution == self._resolution else ROUGH
+        return Sky(air, tolerance=tolerance, resolution=resolution, suns=_suns(sun_zenith), layout=layout)
+
+
+def _suns(sun_zenith: np.ndarray) -> tuple[float, float]:
+    """The range of suns that is solved for."""
+    ends = np.floor(np.degrees(sun_zenith.min()) / SUNS_DEG), np.ceil(np.degrees(sun_zenith.max()) / SUNS_DEG)
+    return tuple(np.radians(SUNS_DEG) * v for v in ends)
 
 
 def _depths(air: Atmosphere) -> np.ndarray:

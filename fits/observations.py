@@ -41,6 +41,7 @@ AZIMUTHS = ("azimuth_deg", "sun_azimuth_deg", "view_azimuth_deg")
 NAMES = ("radiance", "sigma", "relative_sigma", "wavelengths_nm", *PLACES, *AZIMUTHS, "scan", "mask")
 DEFAULT_RELATIVE_SIGMA = 0.01
 CSV_LIMIT = 2**28
+WAVELENGTHS_NM = (100.0, 1e5)  # below, they are in micrometres
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,9 @@ def observations(arrays: Mapping[str, Any], where: str = "observations", *, mixi
             raise InputError(f"{where}: {name} is missing; needed are radiance, wavelengths_nm, {', '.join(PLACES)}")
     nm = _numbers(arrays["wavelengths_nm"], "wavelengths_nm", where)
     nm = np.atleast_1d(nm)
-    if nm.ndim != 1 or not len(nm) or not np.all(np.isfinite(nm) & (nm > 0.0)):
-        raise InputError(f"{where}: wavelengths_nm is {shown(nm.tolist())}; must be a list of numbers > 0")
+    if nm.ndim != 1 or not len(nm) or not np.all((nm >= WAVELENGTHS_NM[0]) & (nm <= WAVELENGTHS_NM[1])):
+        allowed = f"a list of numbers from {WAVELENGTHS_NM[0]:g} to {WAVELENGTHS_NM[1]:g}, nanometres"
+        raise InputError(f"{where}: wavelengths_nm is {shown(nm.tolist())}; must be {allowed}")
     channels = len(nm) if mixing is None else len(mixing)
     radiance = _numbers(arrays["radiance"], "radiance", where)
     if radiance.ndim == 1 and channels == 1:
@@ -176,8 +178,9 @@ def _sigma(arrays: Mapping[str, Any], radiance: np.ndarray, mask: np.ndarray, wh
         raise InputError(f"{where}: {name}{list(_first(bad))} is {given[bad][0]:g}; must be a finite number > 0")
     if name == "sigma":
         return np.array(given)
-    # Dark samples are not known without limit.
-    return given * np.maximum(np.abs(radiance), 1e-3 * np.nanmedian(radiance[radiance > 0.0]))
+    # Dark samples are not known without limit, and of one that is not above 0 a relative error says nothing.
+    median = np.nanmedian(radiance[radiance > 0.0])
+    return given * np.where(radiance > 0.0, np.maximum(radiance, 1e-3 * median), median)
 
 
 def _mask(mask: Any, shape: tuple[int, ...], where: str) -> np.ndarray:

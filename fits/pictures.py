@@ -1,8 +1,12 @@
-"""Pictures of the sky as observations: linear OpenEXR, fisheye or latitude-longitude.
+"""Pictures of the sky as observations: linear OpenEXR, fisheye, latitude-longitude, or by a Mitsuba camera.
 
     [picture]
-    projection = "fisheye"              # or "latlong"
-    fov_deg = 180                       # fisheye: angle across the circle, which touches the picture's shorter sides
+    projection = "fisheye"              # or "latlong", "perspective", "scene"
+    fov_deg = 180                       # fisheye: angle across the circle, which touches the picture's shorter sides;
+                                        # perspective: across the width, less than 180
+    look_at = { origin = [0, 0, 2], target = [-1, 0, 3], up = [0, 0, 1] }     # perspective: as in Mitsuba
+    scene = "noon.xml"                  # scene: Mitsuba scene file with an emitter `atmosphere`, whose sun and altitude
+                                        # then need not be given; its first sensor took the picture
     altitude_m = 0
     sun_zenith_deg = 50
     sun_azimuth_deg = 180               # clockwise from north
@@ -15,7 +19,9 @@
 
 Fisheyes look at the zenith, north up and east on the left, distance from the middle in proportion to the zenith angle:
 the sensor ``fisheye`` of atmo_jit.plugins. Latitude-longitude pictures have the zenith on top and azimuth growing
-to the right: the sensor ``latlong``. A pixel is compared with the sky at its centre.
+to the right: the sensor ``latlong``. A camera's world has Z up, X south and Y west, as the emitter ``atmosphere`` has
+it; of a scene, pixels that show shapes, and their neighbours, are left out. A pixel is compared with the sky at its
+centre.
 """
 
 from __future__ import annotations
@@ -27,9 +33,11 @@ from typing import Any
 
 import numpy as np
 
+from atmo_jit import scenes
 from atmo_jit.errors import InputError, shown
 from atmo_jit.spectrum import SpectralBasis
 
+from .camera import angles_deg, of_scene, perspective, rotation
 from .config import FitConfig
 from .observations import Observations, observations
 
@@ -43,7 +51,7 @@ NUMBERS = {
     "least_elevation_deg": 2.0,
     "sun_distance_deg": 2.0,
 }
-WORDS = {"projection": ("fisheye", "latlong"), "colour": ("srgb", "wavelengths")}
+WORDS = {"projection": ("fisheye", "latlong", "perspective", "scene"), "colour": ("srgb", "wavelengths")}
 
 
 def load_picture(path: str | Path, config: FitConfig) -> Observations:
@@ -52,14 +60,15 @@ def load_picture(path: str | Path, config: FitConfig) -> Observations:
     name = f"observations {shown(str(path), 200)}"
     if config.picture is None:
         raise InputError(f"{name}: is a picture; the configuration needs a table [picture] with projection and sun")
-    settings = _settings(config.picture)
+    folder = Path(path).parent
+    _settings(config.picture, folder)  # before anything is read
     pixels, names = _read(Path(path), name)
     error = None
     if "sigma_file" in config.picture:
-        error, _ = _read(Path(path).parent / str(config.picture["sigma_file"]), "picture.sigma_file")
+        error, _ = _read(folder / str(config.picture["sigma_file"]), "picture.sigma_file")
         if error.shape != pixels.shape:
             raise InputError(f"picture.sigma_file: has {error.shape} pixels and channels, the picture {pixels.shape}")
-    return picture(pixels, settings, config, error=error, names=names, where=name)
+    return picture(pixels, config.picture, config, error=error, names=names, folder=folder, where=name)
 
 
 def picture(
@@ -69,11 +78,12 @@ def picture(
     *,
     error: np.ndarray | None = None,
     names: tuple[str, ...] = (),
+    folder: Path = Path(),
     where: str = "picture",
 ) -> Observations:
     """The observations of a picture [height, width, channels], with its standard error if that is known. ``settings``:
-    the entries of the table above; ``names``: of the channels."""
-    settings = _settings(settings)
+    the entries of the table above; ``names``: of the channels; ``folder``: where a scene is looked for."""
+    settings = _settings(settings, folder, pixels.shape[:2])
     nm = config.atmosphere.wavelengths_nm
     mixing = None
     if settings["colour"] == "srgb":
@@ -112,6 +122,11 @@ def picture(
 def directions(settings: Mapping[str, Any], height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Zenith angle and azimuth (clockwise from north) of the pixels' centres in degrees, and whether the picture shows
     anything there: [height, width]."""
+    if settings["projection"] == "scene":
+        return *angles_deg(settings["camera"].direction), settings["camera"].free
+    if settings["projection"] == "perspective":
+        direction = perspective(settings["turn"], settings["fov_deg"], height, width)
+        return *angles_deg(direction), np.ones((height, width), bool)
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
     if settings["projection"] == "latlong":
         return 180.0 * v, 360.0 * (u - 0.5) + settings["up_deg"], np.ones(u.shape, bool)
@@ -122,21 +137,40 @@ def directions(settings: Mapping[str, Any], height: int, width: int) -> tuple[np
     return radius * settings["fov_deg"] / 2.0, azimuth, radius <= 1.0
 
 
-def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    known = (*NUMBERS, *WORDS, "sigma_file")
+def _settings(
+    given: Mapping[str, Any], folder: Path = Path(), size: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """The checked entries; with the ``size`` of the picture also the camera of a scene."""
+    known = (*NUMBERS, *WORDS, "sigma_file", "look_at", "scene")
     unknown = next((key for key in given if key not in known), None)
     if unknown is not None:
         raise InputError(f"picture: unknown key {shown(unknown)}; allowed are {', '.join(known)}")
     found: dict[str, Any] = {}
-    for key, default in NUMBERS.items():
-        value = given.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-            raise InputError(f"picture.{key}: is {shown(value)}; must be a number")
-        found[key] = float(value)
     for key, words in WORDS.items():
         found[key] = given.get(key, words[0])
         if found[key] not in words:
             raise InputError(f"picture.{key}: is {shown(found[key])}; must be one of {', '.join(words)}")
+    defaults = dict(NUMBERS)
+    if found["projection"] == "scene":
+        if not isinstance(given.get("scene"), str):
+            raise InputError(f"picture.scene: is {shown(given.get('scene'))}; must be the name of a scene file")
+        beside = folder / given["scene"]
+        path = scenes.find(str(beside) if beside.is_file() else given["scene"])
+        defaults |= {"sun_zenith_deg": 0.0}
+        if size is not None:
+            found["camera"] = of_scene(path, *size)
+            zenith, azimuth = (float(v) for v in angles_deg(found["camera"].sun))
+            defaults |= {"sun_zenith_deg": zenith, "sun_azimuth_deg": azimuth}
+            defaults |= {"altitude_m": found["camera"].altitude_m}
+    for key, default in defaults.items():
+        value = given.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+            raise InputError(f"picture.{key}: is {shown(value)}; must be a number")
+        found[key] = float(value)
+    if found["projection"] == "perspective":
+        found["turn"] = rotation(given.get("look_at"))
+        if not 0.0 < found["fov_deg"] < 180.0:
+            raise InputError(f"picture.fov_deg: is {found['fov_deg']:g}; must be between 0 and 180 for a perspective")
     return found
 
 

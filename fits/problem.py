@@ -3,8 +3,8 @@
     predicted = calibration x mixing . L(atmosphere, sun zenith + turn, azimuth - turn)
     residual  = (ln predicted - ln measured) / relative sigma,     or (predicted - measured) / sigma
 
-With a robust loss a residual r becomes f(r), f^2 / 2 = d^2 (sqrt(1 + (r / d)^2) - 1) (pseudo-Huber): quadratic up to
-about d, then linear, so that clouds, masts and what the model cannot follow do not decide. Priors stay quadratic.
+The sum of r^2 / 2 is minimised; with a robust loss that of d^2 (sqrt(1 + (r / d)^2) - 1) (pseudo-Huber): quadratic up
+to about d, then linear, so that clouds, masts and what the model cannot follow do not decide. Priors stay quadratic.
 
 Where residuals are larger than sigma it is the model that errs, and its errors are alike at neighbouring directions and
 wavelengths: hundreds of samples then count as few. ``excess`` says by how much their weight is lowered against that of
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,10 @@ LEAST = 1e-30  # of a predicted radiance whose logarithm is taken
 @dataclass(frozen=True)
 class Evaluation:
     """At one point: ``predicted`` [N, C]; ``raw`` residuals [N, C] over sigma, NaN where no sample is in use;
-    ``residual`` [M], those of samples with the loss in them, then those of the priors; ``jacobian`` [M, P] of it by
-    u, None if it was not asked for."""
+    ``jacobian`` [M, P] by u of those in use and then of the priors, without the loss, None if it is not known."""
 
     predicted: np.ndarray
     raw: np.ndarray
-    residual: np.ndarray
     jacobian: np.ndarray | None = None
 
 
@@ -132,23 +131,34 @@ class Problem:
             first += len(leaf.scalars)
         return found
 
-    def evaluate(self, u: np.ndarray, jacobian: bool = False) -> Evaluation:
-        """Residuals at u, and their derivatives by u."""
-        predicted, raw = self._kept("raw", u, self._raw)
-        loss, slope = (v / np.sqrt(self.excess) for v in _pseudo_huber(raw[self._used], self.huber))
-        priors = [s.prior_residual(x) for s, x in zip(self.scalars, u, strict=True)]
-        with_prior = [i for i, s in enumerate(self.scalars) if np.isfinite(s.prior_sigma)]
-        residual = np.concatenate([loss, [priors[i][0] for i in with_prior]])
-        if not jacobian:
-            return Evaluation(predicted, raw, residual)
-        columns = self.raw_jacobian(u) * slope[:, None]
-        below = np.zeros((len(with_prior), len(self.scalars)))
-        below[np.arange(len(with_prior)), with_prior] = [priors[i][1] for i in with_prior]
-        return Evaluation(predicted, raw, residual, np.concatenate([columns, below]))
+    def evaluate(self, u: np.ndarray) -> Evaluation:
+        """What is predicted at u, and how far it is from the data."""
+        return Evaluation(*self._kept("raw", u, self._raw))
 
-    def raw_jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Derivatives by u of the residuals over sigma of the samples in use, without the loss."""
-        return self._kept("jacobian", u, self._raw_jacobian)
+    def residuals(self, u: np.ndarray) -> np.ndarray:
+        """Residuals [M] over sigma of the samples in use, then those of the priors."""
+        priors = [s.prior_residual(u[i])[0] for i, s in self._with_prior]
+        return np.concatenate([self.evaluate(u).raw[self._used], priors])
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives [M, P] of :meth:`residuals` by u."""
+        below = np.zeros((len(self._with_prior), len(self.scalars)))
+        for row, (i, scalar) in zip(below, self._with_prior, strict=True):
+            row[i] = scalar.prior_residual(u[i])[1]
+        return np.concatenate([self._kept("jacobian", u, self._raw_jacobian), below])
+
+    def loss(self, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The loss of each of M residuals, its slope and its curvature."""
+        count = len(residuals) - len(self._with_prior)
+        samples, priors = residuals[:count], residuals[count:]
+        parts = [v / self.excess for v in _pseudo_huber(samples, self.huber)]
+        return tuple(
+            np.concatenate(v) for v in zip(parts, (0.5 * priors**2, priors, np.ones_like(priors)), strict=True)
+        )
+
+    @property
+    def _with_prior(self) -> list[tuple[int, Scalar]]:
+        return [(i, s) for i, s in enumerate(self.scalars) if np.isfinite(s.prior_sigma)]
 
     def _kept(self, what: str, u: np.ndarray, make: Callable[[np.ndarray], Any]) -> Any:
         """What ``make`` returns at u on the nodes in use; the last few are kept for problems that share samples."""
@@ -180,13 +190,11 @@ class Problem:
                 change = factor * self._mixed(by_leaf[leaf.name] * spread)
                 columns[:, first + k] = (scale * change)[self._used]
             first += len(leaf.scalars)
-        turned: dict[str, np.ndarray] = {}
+        turned = self._turned(values, sun_zenith, azimuth)
         for i, nuisance in enumerate(self._nuisances, first):
             if nuisance.kind.endswith("calibration"):
                 change = predicted / v[i]
             else:
-                if nuisance.kind not in turned:
-                    turned[nuisance.kind] = self._turned(nuisance.kind, values, sun_zenith, azimuth)
                 change = factor * self._mixed(turned[nuisance.kind])
             columns[:, i] = np.where(nuisance.applies, scale * change, 0.0)[self._used]
         return columns * slopes
@@ -220,15 +228,17 @@ class Problem:
         over = zenith < 0.0  # past the zenith: the same direction from the other side
         return factor, np.clip(np.abs(zenith), 0.0, np.pi), np.where(over, azimuth + np.pi, azimuth)
 
-    def _turned(self, kind: str, values: dict[str, Any], zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        """Derivative [N, W] of radiance by a turn of the sun, per degree."""
-        ends = []
-        for sign in (1.0, -1.0):
-            if kind == "sun_zenith":
-                ends.append(self.model.radiance(values, np.abs(zenith + sign * TURN), azimuth, rough=True))
-            else:
-                ends.append(self.model.radiance(values, zenith, azimuth - sign * TURN, rough=True))
-        return (ends[0] - ends[1]) / (2.0 * np.degrees(TURN))
+    def _turned(self, values: dict[str, Any], zenith: np.ndarray, azimuth: np.ndarray) -> dict[str, np.ndarray]:
+        """Derivatives [N, W] of radiance by turns of the sun, per degree, by kind."""
+        kinds = sorted({n.kind for n in self._nuisances if not n.kind.endswith("calibration")})
+        turns = []
+        for kind, sign in product(kinds, (1.0, -1.0)):
+            by = (sign * TURN, 0.0) if kind == "sun_zenith" else (0.0, sign * TURN)
+            turns.append((np.abs(zenith + by[0]), azimuth - by[1]))
+        ends = self.model.turned(values, turns) if turns else []
+        return {
+            kind: (ends[2 * i] - ends[2 * i + 1]) / (2.0 * np.degrees(TURN)) for i, kind in enumerate(kinds)
+        }
 
     def _mixed(self, light: np.ndarray) -> np.ndarray:
         return light if self.data.mixing is None else light @ self.data.mixing.T
@@ -280,14 +290,13 @@ def _starts(leaf: Leaf) -> np.ndarray:
     return np.array([s.start for s in leaf.scalars])
 
 
-def _pseudo_huber(r: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """f(r) and f'(r)."""
+def _pseudo_huber(r: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """d^2 (sqrt(1 + (r / d)^2) - 1), its slope, and its curvature or half of that of the parabola that touches it from
+    above, whichever is more: steps then do not go astray among outliers."""
     if not np.isfinite(d):
-        return r, np.ones_like(r)
+        return 0.5 * r**2, r, np.ones_like(r)
     root = np.sqrt(1.0 + (r / d) ** 2)
-    # f / r without cancellation for small r: root - 1 = (r / d)^2 / (root + 1).
-    quotient = np.sqrt(2.0 / (root + 1.0))
-    return r * quotient, 1.0 / (root * quotient)
+    return r**2 / (root + 1.0), r / root, np.maximum(root**-3.0, 0.5 / root)
 
 
 def without_darkness(data: Observations) -> Observations:

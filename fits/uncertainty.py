@@ -1,7 +1,8 @@
 """How well a fit knows what it found: from the derivatives of the residuals at the minimum.
 
 All of it in the scalars' z (value or its logarithm; see :mod:`atmo_jit.fits.parameters`), J by z, rows of samples (over
-sigma) and of priors apart; kappa is the excess of :mod:`atmo_jit.fits.problem`, 1 where the model follows the data:
+sigma, as much as the loss lets them count) and of priors apart; kappa is the excess of :mod:`atmo_jit.fits.problem`, 1
+where the model follows the data:
 
     covariance          S   = (J_d' J_d + J_p' J_p)^-1            Gauss-Newton; Rodgers 2000, eq. 5.8
     with model error    S_m = (J_d' J_d / kappa + J_p' J_p)^-1
@@ -39,13 +40,17 @@ class Uncertainty:
 
 
 def uncertainty(problem: Problem, u: np.ndarray, found: Evaluation) -> Uncertainty:
-    """The uncertainty at ``u``, where ``found`` holds the residuals and their derivatives."""
+    """The uncertainty at ``u``, where ``found`` holds the derivatives of the residuals."""
     scalars = problem.scalars
     slopes = np.array([s.slopes(x) for s, x in zip(scalars, u, strict=True)])
-    dv, dz = slopes[:, 0], slopes[:, 1]
-    by_z = dv / dz
-    jacobian = found.jacobian / dz
+    dz = np.maximum(np.abs(slopes[:, 1]), 1e-300)  # nothing is left of it at a bound itself
+    by_z = np.array([v if s.logarithmic else 1.0 for s, v in zip(scalars, problem.values(u), strict=True)])
     samples = int(np.count_nonzero(problem.data.used))
+    # A sample counts as much as its loss does beside its square: nine tenths of Gaussian noise, little of outliers.
+    residuals = problem.residuals(u)
+    loss, _, curvature = problem.loss(residuals)
+    worth = np.divide(2.0 * loss, residuals**2, out=curvature, where=residuals != 0.0)
+    jacobian = found.jacobian / dz * np.sqrt(worth)[:, None]
     data, priors = jacobian[:samples], jacobian[samples:]
     weighed, told = data.T @ data, priors.T @ priors
     inverse = _inverse(problem.excess * weighed + told)

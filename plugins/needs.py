@@ -37,7 +37,7 @@ class AtmosphereNeeds:
         turn = matrix[:3, :3] / np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
         direction = np.array(self.found.direction, dtype=np.float64)
         local = direction if self.found.moment is not None else turn.T @ direction
-        self.sun = turn @ local
+        self.turn, self.sun = turn, turn @ local
         self.sun_zenith_deg = float(np.degrees(np.arctan2(np.hypot(local[0], local[1]), local[2])))
 
     def bbox(self) -> Any:
@@ -90,10 +90,24 @@ def needs_of_scene(load: Callable[[Callable[[Any], None]], Any]) -> SceneNeeds:
     return SceneNeeds(light.found, light.sun_zenith_deg, sees_sky, near, int(np.prod(size)))
 
 
-def _seen(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Directions [N, 3] of COLUMNS x ROWS rays of the picture (0 where it shows nothing), and which of them meet no
+def camera_of_scene(
+    load: Callable[[Callable[[Any], None]], Any], width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """What a picture of a scene shows: directions [height, width, 3] of its pixels' centres in the emitter's frame (0
+    where it shows nothing), whether they meet no shape, the sun's direction in that frame, and the emitter's altitude
+    (m). The scene is read with ``load(edit)``."""
+    scene = load(edit)
+    (light,) = (e for e in scene.emitters() if hasattr(e, "sun_zenith_deg"))
+    direction, free = _seen(scene, scene.sensors()[0], width, height)
+    free &= np.any(direction != 0.0, axis=1)
+    local = (direction @ light.turn).reshape(height, width, 3)
+    return local, free.reshape(height, width), light.turn.T @ light.sun, light.found.altitude_m
+
+
+def _seen(scene: Any, sensor: Any, columns: int = COLUMNS, rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
+    """Directions [N, 3] of columns x rows rays of the picture (0 where it shows nothing), and which of them meet no
     shape."""
-    x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     x, y = x.ravel().astype(np.float32), y.ravel().astype(np.float32)
     if dr.is_jit_v(mi.Float):
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(mi.Float(x), mi.Float(y)), mi.Point2f(0.5))
