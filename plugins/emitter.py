@@ -59,6 +59,12 @@ Sun and sky of a planet's atmosphere (:monosp:`atmosphere`)
    - |exposed|, |differentiable| (not ``wavelengths_nm``,
      ``sun_angular_radius_deg`` and tables of phase functions)
 
+ * - wavelengths
+   - |string|
+   - Describe the atmosphere at other wavelengths (nm, with commas between) than it was given at; ``fast``: at the
+     four whose colours are nearly those of forty. The values above are those at the atmosphere's own. (Default: its
+     own; three in ``earth``, ``bruneton2008``, ``hillaire2020`` and ``mars``, too few for the colours of twilight)
+
  * - sun_direction
    - |vector|
    - Direction of the sun in the sky, in world space (No default). It cannot be specified along with one of the

@@ -43,7 +43,8 @@ class AtmospherePath:
      * - atmosphere
        - |string|
        - The atmosphere: a preset, the name of a JSON file, or the JSON text itself. Values of the atmosphere may be
-         replaced by their dotted names, as for the emitter. (Default: that of the scene's emitter ``atmosphere``)
+         replaced by their dotted names and described at other ``wavelengths``, as for the emitter. (Default:
+         that of the scene's emitter ``atmosphere``)
      - |exposed|, |differentiable|, all its numbers, where it is given here
 
      * - center
@@ -134,8 +135,8 @@ class AtmospherePath:
         self.orders = int(props["orders"]) if "orders" in props else None
         self.exposed: ExposedAtmosphere | None = None  # of its own
         if "atmosphere" in props:
-            found = settings.atmosphere_of(props, lambda name: str(mi.file_resolver().resolve(name)))
-            self.exposed = ExposedAtmosphere(found.replace(dict(settings.overrides(props, found))))
+            found = settings.described(props, lambda name: str(mi.file_resolver().resolve(name)))
+            self.exposed = ExposedAtmosphere(found)
         self.aovs = [name.strip() for name in str(props.get("aovs", "")).split(",") if name.strip()]
         for name in self.aovs:
             if name not in AOVS:
