@@ -9,12 +9,14 @@ coefficients in the logarithm of both. Beyond the given wavelengths the ratios a
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from .atmosphere import Atmosphere
-from .spectrum import solar_irradiance
+from .errors import InputError, shown
+from .spectrum import FAST_NM, solar_irradiance
 
 # Mean over 10 nm from each of 360, 370, ... 830 nm, 1e-27 m^2: Serdyuchenko et al. 2014, as in Bruneton's
 # precomputed_atmospheric_scattering (2017), demo.cc.
@@ -41,6 +43,18 @@ def ozone_cross_section(wavelengths_nm: Any) -> np.ndarray:
     Serdyuchenko et al. 2014 as means over 10 nm, linear in between; the last value held outside of 365 to 835 nm.
     """
     return 1e-27 * np.interp(np.asarray(wavelengths_nm, float), 365.0 + 10.0 * np.arange(len(_OZONE)), _OZONE)
+
+
+def chosen(text: str, name: str) -> list[float]:
+    """Wavelengths (nm) by a word of options: "fast", the four that give colours nearly as forty do
+    (spectrum.FAST_NM), or numbers with commas between. Raises InputError under ``name``."""
+    try:
+        nm = list(FAST_NM[4]) if text == "fast" else [float(part) for part in text.split(",")]
+    except ValueError:
+        nm = []
+    if not nm or not all(0.0 < v < math.inf for v in nm):
+        raise InputError(f"{name}: found {shown(text)}; allowed: fast, or numbers > 0 (nm) with commas between")
+    return nm
 
 
 def at_wavelengths(atmosphere: Atmosphere, wavelengths_nm: Any) -> Atmosphere:

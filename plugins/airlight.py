@@ -5,6 +5,7 @@ the solved atmosphere, for the integrator ``atmosphere_path``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +13,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from atmo_jit.backend import row
 from atmo_jit.bake.source import SourceTable
 from atmo_jit.geometry import altitude_along, hits_ground
 from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, visible_sun
 from atmo_jit.quadrature import gauss_legendre
-from atmo_jit.resolution import moments_of
 from atmo_jit.single_scattering import disc_cosine
 from atmo_jit.sky import Sky
 
@@ -51,20 +52,35 @@ class Airlight:
     """The air of a solved ``sky`` around ``globe``, lit by a sun in the direction ``sun`` (unit vector, scene)."""
 
     def __init__(self, sky: Sky, globe: Globe, sun: np.ndarray) -> None:
-        self.sky, self.globe = sky, globe
-        self.bands = sky.bands
+        self.globe = globe
+        self._take(sky)
         self._shells = [Shells(band.optics) for band in self.bands]
-        # Light of one order has nothing but the sun's own beam to lose.
-        self._beams = [beam_extinction(band.optics, scaled=sky.orders != 1) for band in self.bands]
-        self._sources = [band.source and SourceTable(band.field) for band in self.bands]
         for shells in self._shells:
             shells.rule(NODES)
             dr.eval(shells.densest)
+        self._guide = self.bands[0].optics  # says where shadows are looked for
         self.count = len(sky.atmosphere.wavelengths_nm)
         ground = [band.optics.largest_extinction(band.optics.densities(mi.Float(0.0))) for band in self.bands]
         self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
         self.sun = mi.Vector3f(*(float(v) for v in sun))
         dr.make_opaque(self.sun)
+
+    def _take(self, sky: Sky) -> None:
+        self.bands = sky.bands
+        # Light of one order has nothing but the sun's own beam to lose.
+        self._beams = [beam_extinction(band, scaled=sky.orders != 1) for band in self.bands]
+        self._sources = [band.source and SourceTable(band.field) for band in self.bands]
+
+    def moved(self, sky: Sky) -> Airlight:
+        """The light of another sky, at the points and by the pieces of rays that serve this one."""
+        other = copy(self)
+        other._take(sky)
+        return other
+
+    @property
+    def solar(self) -> list[Any]:
+        """Solar irradiance (W)."""
+        return [e for band in self.bands for e in band.optics.solar]
 
     def along(self, ray: Any, length: Any) -> Stretch:
         """The air between a ray's origin and ``length`` (scene units, inf: to the end)."""
@@ -146,7 +162,7 @@ class Airlight:
         before = [0.0 for _ in optics.constituents]
         amounts = self._columns(rays, dr.zeros(mi.Float, dr.width(first)), first, before, FIRST_PARTS)
         h, _, _ = point_along(optics, rays, first)
-        rate = dr.maximum(optics.largest_extinction(optics.densities(h)), LEAST_EXTINCTION)
+        rate = dr.maximum(self._guide.largest_extinction(self._guide.densities(h)), LEAST_EXTINCTION)
         rest = dr.exp(-rate * length)
         count = dr.clip(dr.ceil(most * (1.0 - rest) / FULL_DEPTH), 1.0, float(most))
         count = dr.select(length > 0.0, count, 0.0)
@@ -187,18 +203,19 @@ class Airlight:
         return amounts
 
 
-
-def beam_extinction(optics: Any, *, scaled: bool) -> list[Any]:
+def beam_extinction(band: Any, *, scaled: bool) -> list[Any]:
     """Extinction (1/m) [constituent][channel] of what shapes take away when they shade the air: of sunlight, and,
     ``scaled``, of the light that was scattered so little aside that the same shapes are in its way.
 
     Of every scattering the part chi_2, the second moment of the phase function, counts as not scattered (Joseph,
     Wiscombe and Weinman 1976)."""
-    found = []
-    for k, c in enumerate(optics.constituents):
-        forward = [0.0] * optics.channel_count
-        if scaled and c.phase is not None:
-            forward = [float(moments_of(c.phase.at(int(i)), 2)[2]) for i in optics.indices]
-        found.append([e - f * s for e, f, s in zip(optics.extinction[k], forward, optics.scattering[k], strict=True)])
-    dr.make_opaque(found)
+    optics, count = band.optics, band.optics.channel_count
+    size = len(optics.scatterers) * count
+    # Row 2 of the phase moments.
+    chi = row(optics.phase_moments(band.field.degree), mi.UInt32(2), size) if size and scaled else []
+    found = [list(values) for values in optics.extinction]
+    for n, k in enumerate(optics.scatterers if chi else ()):
+        for c in range(count):
+            found[k][c] = found[k][c] - chi[n * count + c] * optics.scattering[k][c]
+    dr.eval(found)
     return found

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
-from atmo_jit.parameters import parameter_names
 from atmo_jit.sky import Sky
 
 from . import albedo, bounds, settings
 from .exposed import array, first, host, single, variables
+from .exposed_atmosphere import ExposedAtmosphere
 from .light import Light
 from .sun_position import Moment
 
@@ -58,6 +58,12 @@ Sun and sky of a planet's atmosphere (:monosp:`atmosphere`)
      dict loader reserves dots. Derivatives are those of the solved sky (see below).
    - |exposed|, |differentiable| (not ``wavelengths_nm``,
      ``sun_angular_radius_deg`` and tables of phase functions)
+
+ * - wavelengths
+   - |string|
+   - Describe the atmosphere at other wavelengths (nm, with commas between) than it was given at; ``fast``: at the
+     four whose colours are nearly those of forty. The values above are those at the atmosphere's own. (Default: its
+     own; three in ``earth``, ``bruneton2008``, ``hillaire2020`` and ``mars``, too few for the colours of twilight)
 
  * - sun_direction
    - |vector|
@@ -164,10 +170,11 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         given = props.get_texture("albedo") if "albedo" in props else None
         read = None if given is None else lambda nm: albedo.values(given, nm)
         found = settings.read(props, lambda name: str(mi.file_resolver().resolve(name)), read)
-        self._atmosphere, self._limb_darkening = found.atmosphere, found.limb_darkening
+        self._limb_darkening = found.limb_darkening
         ground = found.atmosphere.ground_albedo
         grey = float(ground[0]) if np.ptp(ground) == 0.0 else None
         self._albedo = given if given is not None or grey is None else props.get_texture("albedo", grey)
+        self._exposed = ExposedAtmosphere(found.atmosphere)
         self._albedo_seen = self._albedo_values()
         self._to_world = mi.Transform4f(props["to_world"].matrix) if "to_world" in props else mi.Transform4f()
         numbers = {"altitude": found.altitude_m, "sun_scale": found.sun_scale, "sky_scale": found.sky_scale}
@@ -176,8 +183,6 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             numbers |= {name: getattr(found.moment, name) for name in Moment.names()}
         self._values = {name: array(value) for name, value in numbers.items()}
         self._sun_direction = mi.Vector3f(*found.direction)
-        self._atmosphere_values = {name: array(self._atmosphere.given(name)) for name in self._atmosphere.names()}
-        self._seen = {name: host(value) for name, value in self._atmosphere_values.items()}
         self._sky: Sky | None = None
         self._scene: Any = None
         self._light: Light | None = None
@@ -194,9 +199,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         for name, value in self._values.items():
             callback.put(name, value, free if name in (*SCALES, "altitude") else fixed)
         callback.put("sun_direction", self._sun_direction, mi.ParamFlags.ReadOnly if self._moment else free)
-        continuous = self._continuous()
-        for name, value in self._atmosphere_values.items():
-            callback.put(name, value, free if name in continuous else fixed)
+        self._exposed.traverse(callback)
         callback.put("sky_radiance", self._light.sky_table, free)
         callback.put("sun_radiance", self._light.sun_table, free)
 
@@ -216,25 +219,16 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
 
     def _update_atmosphere(self) -> None:
         """Take over what was written into the exposed parameters since the last time."""
-        now = {name: host(value) for name, value in self._atmosphere_values.items()}
-        changed = {name: value for name, value in now.items() if not np.array_equal(value, self._seen[name])}
-        if changed:
-            plain = {name: float(v[0]) if len(v) == 1 else v.tolist() for name, v in changed.items()}
-            self._atmosphere, self._sky = self._atmosphere.replace(plain), None
-            self._seen = now
+        if self._exposed.update():
+            self._sky = None
         reflected = self._albedo_values()
         if reflected is not None and not np.array_equal(reflected, self._albedo_seen):
-            self._atmosphere, self._sky = settings.with_albedo(self._atmosphere, reflected), None
+            self._exposed.atmosphere, self._sky = settings.with_albedo(self._atmosphere, reflected), None
         self._albedo_seen = reflected
 
-    def _parameters(self) -> dict[str, Any]:
-        """The parameters that carry derivatives into the tables, by their names in atmo_jit."""
-        continuous, named = self._continuous(), self._atmosphere_values
-        return {name: value for name, value in named.items() if name in continuous and dr.grad_enabled(value)}
-
-    def _continuous(self) -> set[str]:
-        """Names of the differentiable values of the atmosphere; the sun's edge is no place for derivatives."""
-        return set(parameter_names(self._atmosphere)) - {"sun_angular_radius_deg"}
+    @property
+    def _atmosphere(self) -> Atmosphere:
+        return self._exposed.atmosphere
 
     def _local_sun(self) -> Any:
         """The sun's direction in the local frame."""
@@ -255,9 +249,8 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
             dr.make_opaque(sun, self._sun_direction)
         if self._sky is None:
             self._sky = _solved(self._atmosphere)
-        light = Light(
-            self._sky, self._values["altitude"], sun, self._limb_darkening, parameters=self._parameters()
-        )
+        follows = self._exposed.followed()
+        light = Light(self._sky, self._values["altitude"], sun, self._limb_darkening, parameters=follows)
         if self._light is not None:
             # The tensors that mi.traverse has handed out stay those that are in use.
             for name in ("sky_table", "sun_table"):
@@ -277,6 +270,16 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
     def sky(self) -> Sky:
         """The solved sky."""
         return self._sky
+
+    @property
+    def exposed(self) -> ExposedAtmosphere:
+        """The atmosphere's numbers as parameters."""
+        return self._exposed
+
+    @property
+    def followed_scales(self) -> dict[str, Any]:
+        """Those of :attr:`scales` by which derivatives are wanted."""
+        return {n: self._values[n] for n in ("sun_scale", "sky_scale") if dr.grad_enabled(self._values[n])}
 
     @property
     def sky_light(self) -> Light:

@@ -177,5 +177,4 @@ class AtmosphereMedium:
 
 def _atmosphere(props: Any) -> Atmosphere:
     """The atmosphere of the properties, with the values that they replace."""
-    atmosphere = settings.atmosphere_of(props, lambda name: str(mi.file_resolver().resolve(name)))
-    return atmosphere.replace(dict(settings.overrides(props, atmosphere)))
+    return settings.described(props, lambda name: str(mi.file_resolver().resolve(name)))

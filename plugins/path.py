@@ -8,14 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, InputError, shown
 from atmo_jit.sky import Sky
 
 from . import settings
 from .airlight import Airlight
 from .colours import Colours
+from .exposed import array, host
+from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
+from .linearized import Changes, LinearizedSky, unit_changes
 from .shadow_volume import shadowed_interval
 from .skylight import Skylight
 from .volpath import mis_weight, unpolarized
@@ -24,6 +26,8 @@ from .volpath import mis_weight, unpolarized
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
+SCALES = ("sun_scale", "sky_scale")
+TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
 
 
@@ -39,7 +43,9 @@ class AtmospherePath:
      * - atmosphere
        - |string|
        - The atmosphere: a preset, the name of a JSON file, or the JSON text itself. Values of the atmosphere may be
-         replaced by their dotted names, as for the emitter. (Default: that of the scene's emitter ``atmosphere``)
+         replaced by their dotted names and described at other ``wavelengths``, as for the emitter. (Default:
+         that of the scene's emitter ``atmosphere``)
+     - |exposed|, |differentiable|, all its numbers, where it is given here
 
      * - center
        - |point|
@@ -88,6 +94,11 @@ class AtmospherePath:
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.
 
+    **Derivatives.** A picture follows every number of the atmosphere but the two radii, and the emitter's ``sun_scale``
+    and ``sky_scale``, through ``mi.render(scene, params)`` with ``dr.forward`` and ``dr.backward``. Each number takes
+    two more pictures, of the same paths in air a little before and after it; in reverse too. Reflectances, shapes and
+    the sun's place are refused.
+
     Reflectances are colours, air is a matter of wavelengths: each path carries one factor for every channel and one
     for every wavelength, and the picture is what the rule of the emitter makes of both. Vectorised, unpolarised
     variants only. Media, and ``null`` surfaces with them, are not supported.
@@ -122,15 +133,80 @@ class AtmospherePath:
             raise AtmosphereError("scale", shown(self.scale), "a number > 0")
         self.center = np.array(props["center"], dtype=np.float64) if "center" in props else None
         self.orders = int(props["orders"]) if "orders" in props else None
-        self.atmosphere: Atmosphere | None = None
+        self.exposed: ExposedAtmosphere | None = None  # of its own
         if "atmosphere" in props:
-            found = settings.atmosphere_of(props, lambda name: str(mi.file_resolver().resolve(name)))
-            self.atmosphere = found.replace(dict(settings.overrides(props, found)))
+            found = settings.described(props, lambda name: str(mi.file_resolver().resolve(name)))
+            self.exposed = ExposedAtmosphere(found)
         self.aovs = [name.strip() for name in str(props.get("aovs", "")).split(",") if name.strip()]
         for name in self.aovs:
             if name not in AOVS:
                 raise AtmosphereError("aovs", shown(name), f"{' and '.join(AOVS)}, separated by a comma")
         self._held: tuple[Any, ...] | None = None
+        self._solved: LinearizedSky | None = None
+        self._moving: tuple[Skylight, Airlight, Colours] | None = None  # while a derivative is rendered
+
+    # ---- parameters
+
+    def traverse(self, callback: Any) -> None:
+        mi.SamplingIntegrator.traverse(self, callback)
+        if self.exposed is not None:
+            self.exposed.traverse(callback)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        mi.SamplingIntegrator.parameters_changed(self, list(keys))
+        if self.exposed is not None and self.exposed.update():
+            self._held = None
+
+    def _followed(self, scene: Any, params: Any) -> dict[str, Any]:
+        """The numbers by which derivatives are wanted. Raises InputError if some are wanted by anything else."""
+        emitter = self._emitter(scene)
+        found = (self.exposed or emitter.exposed).followed() | emitter.followed_scales
+        allowed = {value.index_ad for value in found.values()}
+        for key, value in params or ():
+            if key.rpartition(".")[2] in TABLES or not (dr.is_diff_v(value) and dr.grad_enabled(value)):
+                continue
+            if getattr(value, "index_ad", None) not in allowed:
+                raise InputError(f"{key}: atmosphere_path has no derivatives by it, only by the atmosphere's values")
+        return found
+
+    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+        changes = {name: host(dr.grad(value)) for name, value in self._followed(scene, params).items()}
+        return self._derivative(scene, sensor, seed, spp, changes)
+
+    def render_backward(
+        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> None:
+        followed = self._followed(scene, params)
+        found = {name: np.zeros(len(value)) for name, value in followed.items()}
+        for name, i, change in unit_changes(followed):
+            moved = self._derivative(scene, sensor, seed, spp, change)
+            found[name][i] = float(dr.sum(moved.array * grad_in.array)[0])
+        for name, value in followed.items():
+            dr.accum_grad(value, array(found[name]))
+
+    def _derivative(self, scene: Any, sensor: Any, seed: Any, spp: int, changes: Changes) -> Any:
+        """How the picture changes along changes of numbers by name: see :mod:`.linearized`."""
+        emitter = self._emitter(scene)
+        air = (self.exposed or emitter.exposed).atmosphere
+        if self._solved is None or self._solved.atmosphere != air:
+            self._solved = LinearizedSky(air, self.orders)
+        apart, skies = self._solved.ends({name: v for name, v in changes.items() if name not in SCALES})
+        light, middle, colours = self._made(emitter, self._solved.sky)
+        pictures = []
+        with dr.suspend_grad():
+            for sky, sign in zip(skies, (-0.5, 0.5), strict=True):
+                there = middle.moved(sky)
+                moved = light.moved(there.solar, *(sign * apart * float(changes.get(n, [0.0])[0]) for n in SCALES))
+                self._moving = moved, there, colours
+                try:
+                    picture = self.render(scene, sensor, seed, spp, develop=True, evaluate=False)
+                    dr.eval(picture)
+                    pictures.append(picture)
+                finally:
+                    self._moving = None
+        return (pictures[1] - pictures[0]) * (1.0 / apart)
+
+    # ---- light
 
     def aov_names(self) -> list[str]:
         count = len(mi.UnpolarizedSpectrum(0.0))
@@ -278,24 +354,31 @@ class AtmospherePath:
 
     def _parts(self, scene: Any) -> tuple[Skylight, Airlight, Colours]:
         """The light of the scene's emitter, its air and the colours of both, made again where the emitter changed."""
-        emitters = [e for e in scene.emitters() if hasattr(e, "sky_light")]
-        if len(emitters) != 1:
-            raise InputError(f"atmosphere_path: the scene has {len(emitters)} emitters of type atmosphere; must be one")
-        emitter = emitters[0]
-        key = (id(emitter), id(emitter.sky_light), id(emitter.sky))
+        if self._moving is not None:
+            return self._moving
+        emitter = self._emitter(scene)
+        key = id(emitter), id(emitter.sky_light), id(emitter.sky)
         if self._held is None or self._held[0] != key:
             sky = emitter.sky
-            if self.atmosphere is not None or self.orders is not None:
-                sky = Sky(self.atmosphere or sky.atmosphere, self.orders)
-            center = self.center
-            if center is None:
-                distance = sky.atmosphere.bottom_radius_m + emitter.altitude_m
-                center = -distance * self.scale * emitter.up
-            light = Skylight(emitter, sky.atmosphere, SKY_SHARE)
-            air = Airlight(sky, Globe(sky.atmosphere, center, self.scale), emitter.sun)
-            self._held = key, emitter, (light, air, Colours(sky.atmosphere))
+            if self.exposed is not None or self.orders is not None:
+                sky = Sky(self.exposed.atmosphere if self.exposed else sky.atmosphere, self.orders)
+            self._held = key, emitter, self._made(emitter, sky)  # the emitter, so that no other gets its id
         self._held[2][0].refresh()
         return self._held[2]
+
+    def _emitter(self, scene: Any) -> Any:
+        found = [e for e in scene.emitters() if hasattr(e, "sky_light")]
+        if len(found) != 1:
+            raise InputError(f"atmosphere_path: the scene has {len(found)} emitters of type atmosphere; must be one")
+        return found[0]
+
+    def _made(self, emitter: Any, sky: Sky) -> tuple[Skylight, Airlight, Colours]:
+        center = self.center
+        if center is None:
+            distance = sky.atmosphere.bottom_radius_m + emitter.altitude_m
+            center = -distance * self.scale * emitter.up
+        air = Airlight(sky, Globe(sky.atmosphere, center, self.scale), emitter.sun)
+        return Skylight(emitter, air.solar, SKY_SHARE), air, Colours(sky.atmosphere)
 
     def to_string(self) -> str:
         return f"AtmospherePath[max_depth = {self.max_depth}, shaft_samples = {self.shaft_samples}]"

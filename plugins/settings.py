@@ -17,6 +17,7 @@ import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, InputError, shown
+from atmo_jit.wavelengths import at_wavelengths, chosen
 
 from .sun_position import Moment, sun_direction
 
@@ -70,7 +71,7 @@ def read(props: Any, find_file: Any, albedo: Any = None) -> Settings:
         if not 0.0 < aperture < 180.0:
             raise AtmosphereError("sun_aperture", shown(aperture), "a number of degrees in (0, 180)")
         changes["sun_angular_radius_deg"] = aperture / 2.0
-    atmosphere = atmosphere.replace(changes)
+    atmosphere = at_given_wavelengths(props, atmosphere.replace(changes))
     if albedo is not None:
         atmosphere = with_albedo(atmosphere, albedo(atmosphere.wavelengths_nm))
     direction, moment = _sun(props)
@@ -165,6 +166,23 @@ def atmosphere_of(props: Any, find_file: Any) -> Atmosphere:
             raise AtmosphereError("atmosphere", f"invalid JSON ({error})", "a JSON object") from None
     found = Path(find_file(source))
     return Atmosphere.load(found if found.is_file() else source)
+
+
+def at_given_wavelengths(props: Any, atmosphere: Atmosphere) -> Atmosphere:
+    """``atmosphere`` described at the wavelengths that the parameter ``wavelengths`` names, if it is there."""
+    if "wavelengths" not in props:
+        return atmosphere
+    given = props["wavelengths"]
+    if not isinstance(given, str):
+        found = values(given)
+        given = ",".join(f"{v:g}" for v in found) if isinstance(found, list) else str(found)
+    return at_wavelengths(atmosphere, chosen(given, "wavelengths"))
+
+
+def described(props: Any, find_file: Any) -> Atmosphere:
+    """The atmosphere of the properties: parameter ``atmosphere``, other values in it, ``wavelengths``."""
+    atmosphere = atmosphere_of(props, find_file)
+    return at_given_wavelengths(props, atmosphere.replace(dict(overrides(props, atmosphere))))
 
 
 def overrides(props: Any, atmosphere: Atmosphere) -> Iterable[tuple[str, Any]]:

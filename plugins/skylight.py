@@ -4,22 +4,19 @@ sun, and directions drawn where the sky is bright.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from atmo_jit.atmosphere import Atmosphere
-
-from .exposed import number
-
 
 class Skylight:
-    """``sky_share``: of the directions at smooth surfaces that :meth:`sample_sky` draws."""
+    """``solar``: irradiance at the top of the air (W). ``sky_share``: of the directions at smooth surfaces that
+    :meth:`sample_sky` draws."""
 
-    def __init__(self, emitter: Any, atmosphere: Atmosphere, sky_share: float) -> None:
-        self.emitter, self._share = emitter, sky_share
-        self.solar = [number(v) for v in atmosphere.solar_irradiance]
+    def __init__(self, emitter: Any, solar: list[Any], sky_share: float) -> None:
+        self.emitter, self.solar, self._share = emitter, solar, sky_share
         self.refresh()
 
     def refresh(self) -> None:
@@ -27,6 +24,13 @@ class Skylight:
         self.sun_scale, self.sky_scale = self.emitter.scales
         self._light = self.emitter.sky_light
         self.sun_density = self._light.sun_density
+
+    def moved(self, solar: list[Any], sun_scale: float, sky_scale: float) -> Skylight:
+        """The same for another solar irradiance and scales that are larger by so much."""
+        other = copy(self)
+        other.solar = solar
+        other.sun_scale, other.sky_scale = self.sun_scale + sun_scale, self.sky_scale + sky_scale
+        return other
 
     @staticmethod
     def pointers(lamps: list[Any]) -> Any:

@@ -33,14 +33,15 @@ class SourceTable:
         channels, kinds = optics.channel_count, len(optics.scatterers)
         basis = legendre(degree, np.cos(np.linspace(0.0, np.pi, self._zeniths)))[:, None, :]
         basis = basis * np.cos(np.linspace(0.0, np.pi, self._azimuths)[:, None] * m)
-        chi = optics.scatterers_moments(degree)[l_].reshape(len(l_), kinds, channels)
+        self._count = kinds * channels
+        chi = optics.phase_moments(degree).numpy().reshape(degree + 1, -1)[l_, : self._count]
+        chi = chi.reshape(len(l_), kinds, channels)
         moments = field.refined_moments()  # [nodes, pairs, channels]
         values = np.empty((len(moments), self._zeniths * self._azimuths, kinds, channels), dtype=np.float32)
         flat = basis.reshape(-1, len(l_)).astype(np.float32)
         for k in range(kinds):
             for c in range(channels):
-                values[:, :, k, c] = (moments[:, :, c] * chi[:, k, c].astype(np.float32)) @ flat.T
-        self._count = kinds * channels
+                values[:, :, k, c] = (moments[:, :, c] * chi[:, k, c]) @ flat.T
         self._table = table(values.reshape(*values.shape[:2], -1))
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
 import sys
 from dataclasses import asdict
@@ -39,15 +38,9 @@ def command(preset: str | None, wavelengths: str | None, as_json: bool) -> None:
 def _at_wavelengths(preset: str, text: str) -> str:
     """The JSON of a preset described at other wavelengths."""
     from atmo_jit.atmosphere import Atmosphere
-    from atmo_jit.spectrum import FAST_NM
-    from atmo_jit.wavelengths import at_wavelengths
+    from atmo_jit.wavelengths import at_wavelengths, chosen
 
-    try:
-        nm = FAST_NM[4] if text == "fast" else [float(part) for part in text.split(",")]
-    except ValueError:
-        nm = []
-    if not nm or not all(0.0 < v < math.inf for v in nm):
-        raise InputError(f"--wavelengths: found {shown(text)}; allowed: fast, or numbers > 0 (nm) with commas between")
+    nm = chosen(text, "--wavelengths")
     return json.dumps(at_wavelengths(Atmosphere.load(preset), nm).to_dict(), indent=2) + "\n"
 
 

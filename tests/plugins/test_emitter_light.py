@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from emitters import LUMINANCE, columns, looking, plane, sampled, seen, sun
 
+from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.sky import Sky
-from atmo_jit.spectrum import SpectralBasis
+from atmo_jit.spectrum import SpectralBasis, xyz_to_srgb
+from atmo_jit.wavelengths import at_wavelengths
 
 # Asked of the emitter: irradiance within 0.5 % of the tables' plus three standard deviations.
 IRRADIANCE = 0.005
@@ -191,3 +193,25 @@ def test_looking_is_defined_everywhere(emitter) -> None:
     special = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [1e-20, 0, 1]], dtype=np.float64)
     assert np.isfinite(columns(both.eval(looking(special)))).all()
     assert dr.all(both.eval(looking(special), mi.Bool(False)) == 0.0, axis=None)
+
+
+@pytest.mark.parametrize("elevation", [40.0, 2.0, -4.0])
+def test_fast_wavelengths_have_the_colours_of_forty(rgb, elevation):
+    """CIE Delta E 2000 under the exposure that gives the true colour half the luminance of white."""
+    pytest.importorskip("colour")
+    from bench.colour import difference, true_xyz
+
+    nm = np.arange(380.0, 771.0, 10.0)
+    rng = np.random.default_rng(2)
+    zenith, azimuth = np.arccos(rng.uniform(0.05, 1.0, 60)), rng.uniform(0.0, np.pi, 60)
+    views = [np.zeros(60), np.full(60, np.radians(90.0 - elevation)), zenith, azimuth]
+    truth = Sky(at_wavelengths(Atmosphere.load("earth"), nm))
+    light = np.stack([v.numpy() for v in truth.rays(*views).radiance], axis=-1)
+    directions = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1)
+    worst = {}
+    for given in ({}, {"wavelengths": "fast"}):
+        options = {"sun_direction": sun(elevation), "sun_scale": 0.0, "altitude": 0.0, **given}
+        found = seen(mi.load_dict({"type": "atmosphere", **options}), directions)
+        worst[len(given)] = difference(found @ np.linalg.inv(xyz_to_srgb()).T, true_xyz(light)).max()
+    assert worst[1] < 1.5
+    assert elevation > 30.0 or worst[0] > 3.0  # and the preset's own three are not enough at twilight

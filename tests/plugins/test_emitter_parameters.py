@@ -278,6 +278,7 @@ REFUSED = [
     ({"atmosphere": '{"air": 1}'}, "air: found an unknown key"),
     ({"mie_phase_g": 3.0}, r"mie\.phase\.g: found 3\.0"),
     ({"mie_scattering_per_m": "1e-5 2e-5"}, r"mie\.scattering_per_m: found a list of 2; allowed: a list of 3"),
+    ({"wavelengths": "few"}, r"wavelengths: found .few.; allowed: fast, or numbers > 0"),
     ({"to_world": "stretched"}, "to_world: found a transformation that distorts angles"),
 ]
 

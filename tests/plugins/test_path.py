@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 
+import drjit as dr
 import numpy as np
 import pytest
 from ztests import assert_agree, of_passes
@@ -91,10 +92,10 @@ def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
     assert_agree(*found)
 
 
-def shaded(integrator, orders=None, **options):
-    """Two black towers, kilometres high, between the camera and the sun, in haze."""
+def shaded(integrator, orders=None, grey=0.0, **options):
+    """Two towers, kilometres high, black or grey, between the camera and the sun, in haze."""
     at, atmosphere = mi.ScalarTransform4f(), atmo_jit.Atmosphere.load(HAZE)
-    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}
+    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": grey}}
     towers = {
         "west": {"type": "cube", "to_world": at.translate([-1200, 6000, 1300]).scale([900, 400, 1500]), "bsdf": black},
         "east": {"type": "cube", "to_world": at.translate([2000, 5000, 1000]).scale([900, 400, 1200]), "bsdf": black},
@@ -103,7 +104,9 @@ def shaded(integrator, orders=None, **options):
     if integrator == "atmosphere_path":
         sky = {"type": "atmosphere", "atmosphere": json.dumps(HAZE), "sun_direction": SUN.tolist(), "altitude": 0.0}
         sky["sun_scale"] = 0.0  # the disc itself would only add noise
-        parts = {"integrator": {"type": integrator, "max_depth": 1, "orders": orders, **options}, "sky": sky}
+        orders = {} if orders is None else {"orders": orders}
+        depth = 1 if grey == 0.0 else 3
+        parts = {"integrator": {"type": integrator, "max_depth": depth, **orders, **options}, "sky": sky}
     else:
         from atmo_jit.plugins.planet import planet
 
@@ -230,6 +233,86 @@ def test_one_emitter_is_needed(rgb):
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "atmosphere_path"}, "sensor": sensor})
     with pytest.raises((InputError, RuntimeError), match="0 emitters of type atmosphere"):
         scene.integrator().render(scene, spp=1)
+
+
+def followed(scene, key, *, reverse=True, **options):
+    """The derivative of a picture by a parameter, forward, and that of its sum in reverse."""
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    params.set_dirty(key)
+    params.update()
+    picture = mi.render(scene, params, **options)
+    dr.forward(params[key])
+    forward, found = np.array(dr.grad(picture), dtype=np.float64), None
+    if reverse:
+        dr.set_grad(params[key], 0.0)
+        dr.backward(dr.sum(mi.render(scene, params, **options).array))
+        found = np.array(dr.grad(params[key]), dtype=np.float64)
+    dr.disable_grad(params[key])
+    params.set_dirty(key)
+    params.update()
+    return forward, found
+
+
+@pytest.mark.parametrize("names", [["mie.phase.g"], pytest.param(["mie.scale_height_m"], marks=pytest.mark.slow)])
+def test_derivatives_of_the_sky_are_those_of_the_solver(rgb, names):
+    sun, view = np.array([0.25, 1.0, 0.5]), np.array([0.3, 1.0, 0.1])
+    origin = np.array([0.0, 0.0, 100.0])
+    sensor = camera(1, 1, origin.tolist(), (origin + view).tolist(), fov=1e-3, far_clip=1e8)
+    sky = {"type": "atmosphere", "sun_direction": sun.tolist(), "altitude": 0.0, "mie_scattering_per_m": 3e-5}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "atmosphere_path"}, "sky": sky, "sensor": sensor})
+    zeniths = [np.degrees(np.arccos(d[2] / np.linalg.norm(d))) for d in (sun, view)]
+    azimuths = [np.degrees(np.arctan2(d[1], d[0])) for d in (sun, view)]
+    views = dict(zip(("sun_zenith_deg", "view_zenith_deg"), zeniths, strict=True))
+    views |= {"altitude_m": 100.0, "azimuth_deg": azimuths[1] - azimuths[0]}
+    air = atmo_jit.Atmosphere.load("earth").replace({"mie.scattering_per_m": 3e-5})
+    matrix = SpectralBasis.of(air).srgb_matrix
+    expected = atmo_jit.linearize(air, views).jacobian(names)
+    for name in names:
+        forward = followed(scene, f"sky.{name}", reverse=False, spp=1)[0]
+        by = matrix @ expected[name][0]
+        # Two nodes a piece and a table of the field cost as much here as in the picture itself.
+        np.testing.assert_allclose(forward[0, 0], by, atol=0.015 * np.abs(by).max())
+
+
+@pytest.mark.parametrize("where", ["sky", pytest.param("integrator", marks=pytest.mark.slow)])
+def test_derivatives_behind_shapes_are_differences_of_pictures(plugins, where):
+    """Shafts, sunlit and skylit surfaces in haze; the atmosphere is exposed where it was given."""
+    mi.set_variant("llvm_ad_mono")
+    air = json.dumps(HAZE)
+    options = {"atmosphere": air} if where == "integrator" else {}
+    scene = shaded("atmosphere_path", grey=0.5, **options)
+    key = f"{where}.mie.scattering_per_m"
+    forward, reverse = followed(scene, key, spp=32)
+    step, pictures = 0.1 * HAZE["mie"]["scattering_per_m"][0], []
+    for sign in (-1.0, 1.0):
+        params = mi.traverse(scene)
+        params[key] = HAZE["mie"]["scattering_per_m"][0] + sign * step
+        params.update()
+        pictures.append(passes(scene, 1, 128)[0])
+    difference = (pictures[1] - pictures[0]) / (2.0 * step)
+    forward, difference = (tiles(v[None], 16)[0] for v in (forward, difference))
+    scale = np.abs(difference).mean()
+    assert np.isfinite(forward).all()
+    assert np.ptp(difference) > scale  # some of it brightens, some darkens
+    np.testing.assert_allclose(forward, difference, atol=0.1 * scale)
+    np.testing.assert_allclose(reverse[0], forward.sum() * 16**2, rtol=1e-3, atol=0.01 * scale)
+
+
+@pytest.mark.parametrize(("key", "text"), [("ball.bsdf.reflectance.value", "ball.bsdf"), ("sky.bottom_radius_m",) * 2])
+def test_what_has_no_derivative_is_named(rgb, key, text):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "atmosphere_path"},
+            "sky": {"type": "atmosphere", "sun_direction": [0.2, 1.0, 0.3]},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+        }
+    )
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    with pytest.raises(InputError, match=text.rpartition(".")[2]):
+        scene.integrator().render_forward(scene, params, spp=1)
 
 
 def test_the_unit_of_length_does_not_matter(rgb):
