@@ -168,7 +168,7 @@ def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = No
         densities = optics.densities(there)
         return index + 1, [dr.fma(length, d, total) for d, total in zip(densities, totals, strict=True)]
 
-    last = dr.opaque(t.UInt, count * (len(optics.breaks_m) - 1), 1)
+    last = dr.opaque(t.UInt, count * (dr.width(breaks) - 1), 1)
     zero = [dr.zeros(t.Float, dr.width(h)) for _ in optics.constituents]
     _, totals = dr.while_loop((t.UInt(0), zero), lambda i, _: i < last, add, max_iterations=-1, label="column_up")
     return totals

@@ -157,7 +157,8 @@ class Field:
             guide = self.reference.at(level, x, active, self._guide)
             values = [packet(buffer, level * suns + s + i, size, active) for i in (0, 1)]
             logs.append(
-                [dr.log(guide[c] * dr.maximum(dr.lerp(values[0][c], values[1][c], fs), 1e-30)) for c in channels]
+                # Deep in the shadow the product of both leaves single precision.
+                [dr.log(dr.maximum(guide[c] * dr.lerp(values[0][c], values[1][c], fs), 1e-37)) for c in channels]
             )
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
         above = self.optics.scattering_depths(self.columns.upward(h))

@@ -2,8 +2,9 @@
 one pass.
 
 A ray is cut where something happens: at the altitudes where a profile has a kink or has changed by some e-folds, at
-its perigee, where it enters or leaves the planet's shadow, and wherever a channel's optical depth has grown by
-MAX_DEPTH. Inside a piece everything is smooth and four Gauss-Legendre nodes suffice, in clear air and in fog alike.
+its perigee, where it enters or leaves the planet's shadow, and wherever the optical depth has grown by MAX_DEPTH in a
+channel in which anything is still seen. Inside a piece everything is smooth and four Gauss-Legendre nodes suffice, in
+clear air and in fog alike.
 Every ray stops as soon as its transmittance is spent.
 """
 
@@ -15,7 +16,7 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, parameter, types
+from .backend import floats, packet, parameter, row, table_of, types
 from .column import SunColumns
 from .geometry import altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
 from .optics import Optics
@@ -120,8 +121,8 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
 
 
 class Shells:
-    """What a march looks up: the altitudes (m) at which it cuts, the largest extinction (1/m) between two of them, and
-    quadrature rules."""
+    """What a march looks up: the altitudes (m) at which it cuts, the largest extinction (1/m) of every channel between
+    two of them (a table [shell, channel]), and quadrature rules."""
 
     def __init__(self, optics: Optics) -> None:
         self.breaks = floats(optics.breaks_m)
@@ -181,8 +182,9 @@ class Cuts:
         """The shell that each ray starts in."""
         return _first_shell(self._optics, self._rays, self._breaks, self._last)
 
-    def after(self, d: Any, shell: Any) -> tuple[Any, Any]:
-        """Distance to the end of the piece that starts at ``d`` in ``shell``, and the shell after it."""
+    def after(self, d: Any, shell: Any, amounts: list[Any]) -> tuple[Any, Any]:
+        """Distance to the end of the piece that starts at ``d`` in ``shell``, ``amounts`` of matter (m) away, and the
+        shell after it."""
         t, rays, radius, breaks = types(), self._rays, self._optics.radius, self._breaks
         falling = self._r_mu + d < 0.0
         target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
@@ -196,7 +198,12 @@ class Cuts:
                 distance_up(radius, rays.h, rays.mu, target),
             ),
         )
-        longest = MAX_DEPTH / dr.maximum(dr.gather(t.Float, self._densest, t.UInt(shell)), 1e-30)
+        depths = self._optics.optical_depths(amounts)
+        rate = t.Float(1e-30)
+        # Fog in one channel is no reason for small steps in the others once it hides everything.
+        for depth, densest in zip(depths, row(self._densest, t.UInt(shell), len(depths)), strict=True):
+            rate = dr.select(depth < SPENT_DEPTH, dr.maximum(rate, densest), rate)
+        longest = MAX_DEPTH / rate
         limit = d + dr.minimum(longest, self._farthest)
         end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
         for edge in self._edges:
@@ -235,7 +242,7 @@ def march(
     phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
-        end, shell = cuts.after(d, shell)
+        end, shell = cuts.after(d, shell, amounts)
         length = end - d
 
         density = [
@@ -331,12 +338,11 @@ def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
 
 
 def _largest_extinctions(optics: Optics, breaks: Any) -> Any:
-    """Largest extinction coefficient (1/m) of each shell: profiles are monotone between breaks, so it is at one of
-    its ends."""
+    """Largest extinction coefficient (1/m) of each shell and channel: profiles are monotone between breaks, so it is at
+    one of a shell's ends."""
     t = types()
-    count = len(optics.breaks_m)
-    at_breaks = optics.largest_extinction(optics.densities(breaks))
+    lower = dr.arange(t.UInt, len(optics.breaks_m) - 1)
     # A step in a tabulated profile sits on a break, and the density there is the upper side's.
-    under = optics.largest_extinction(optics.densities(breaks * (1.0 - 1e-6)))
-    lower = dr.arange(t.UInt, count - 1)
-    return dr.maximum(dr.gather(t.Float, at_breaks, lower), dr.gather(t.Float, under, lower + 1))
+    ends = dr.gather(t.Float, breaks, lower), dr.gather(t.Float, breaks, lower + 1) * (1.0 - 1e-6)
+    low, high = (optics.extinctions(optics.densities(h)) for h in ends)
+    return table_of([dr.maximum(a, b) for a, b in zip(low, high, strict=True)], lower)

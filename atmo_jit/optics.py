@@ -26,6 +26,9 @@ PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 # Scale heights at which rays are cut: the field is asked once between two cuts.
 LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)
+# In fog, more: as long as a horizontal ray there has this optical depth.
+FURTHER, THIN = 4.0, 0.05
+RAMP, THICK = 0.25, 4.0
 _VALUES = (
     "radius",
     "thickness",
@@ -140,9 +143,13 @@ class Optics:
             type(c.profile)(*numbers).density(h) for c, numbers in zip(self.constituents, self.profiles, strict=True)
         ]
 
+    def extinctions(self, densities: list[Any]) -> list[Any]:
+        """Extinction coefficient (1/m) per channel."""
+        return self.optical_depths(densities)
+
     def largest_extinction(self, densities: list[Any]) -> Any:
         """Extinction coefficient (1/m) of the most opaque channel."""
-        return _maximum([self._sum(channel, densities) for channel in range(self.channel_count)])
+        return _maximum(self.extinctions(densities))
 
     def optical_depths(self, columns: list[Any]) -> list[Any]:
         """Optical depth per channel of the column densities (m) of all constituents."""
@@ -226,12 +233,16 @@ class Optics:
         e-folds at most."""
         top = self.atmosphere.thickness_m
         levels = [0.0, top]
-        for c in self.constituents:
-            levels += [k for k in c.profile.kinks_m]
-            if isinstance(c.profile, Exponential):
-                levels += [c.profile.scale_height_m * f for f in LEVELS]
-        levels = np.unique(np.clip(levels, 0.0, top))
+        radius = self.atmosphere.bottom_radius_m
         kinks = {k for c in self.constituents for k in c.profile.kinks_m}
+        for c in self.constituents:
+            extinction = float(np.max(c.extinction_per_m))
+            if isinstance(c.profile, Exponential):
+                levels += _scale_height_levels(c.profile.scale_height_m, extinction, radius, top)
+            else:
+                kinks.update(_ramp_levels(c.profile, extinction, radius))
+        levels += kinks
+        levels = np.unique(np.clip(levels, 0.0, top))
         # A scale-height level beside another break only costs time; kinks stay.
         kept = [0.0]
         for level in levels[1:]:
@@ -257,6 +268,35 @@ class Optics:
             if isinstance(profile, Tabulated):
                 kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
         return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
+
+
+def _scale_height_levels(height: float, extinction: float, radius: float, top: float) -> list[float]:
+    """Altitudes (m) at which an exponential profile is cut."""
+    levels = [height * f for f in LEVELS]
+    horizontal = extinction * np.sqrt(2.0 * np.pi * (radius + top) * height)
+    while levels[-1] < top and horizontal * np.exp(-levels[-1] / height) > THIN:
+        levels.append(levels[-1] + FURTHER * height)
+    return levels
+
+
+def _ramp_levels(profile: Tent | Tabulated, extinction: float, radius: float) -> list[float]:
+    """Altitudes (m) between the corners of a profile at which it has fallen by a factor RAMP, again and again, as long
+    as a ray through what is below that may be thick: one that grazes the thin end meets as little as it is."""
+    if isinstance(profile, Tent):
+        altitude, density = np.array(profile.kinks_m), np.array([0.0, 1.0, 0.0])
+    else:
+        altitude, density = profile.altitude_m, profile.values
+    low, high = altitude[:-1], altitude[1:]
+    dense, thin = np.maximum(density[:-1], density[1:]), np.minimum(density[:-1], density[1:])
+    depth = 2.0 * extinction * dense * np.sqrt(np.maximum((high - low) * (2.0 * radius + low + high), 0.0))
+    levels = []
+    for i in np.flatnonzero((high > low) & (thin < RAMP * dense) & (RAMP * depth > THICK)):
+        count = np.arange(1, 1 + int(np.log(depth[i] / THICK) / -np.log(RAMP)))
+        parts = RAMP**count * dense[i]
+        parts = parts[parts > thin[i]]
+        at = (parts - density[i]) / (density[i + 1] - density[i])
+        levels += (low[i] + at * (high[i] - low[i])).tolist()
+    return levels
 
 
 @lru_cache(maxsize=16)

@@ -60,7 +60,7 @@ class Pieces:
 
             def cut(store: Any) -> Any:
                 def piece(d: Any, shell: Any, amounts: list[Any], number: Any) -> tuple[Any, ...]:
-                    end, shell = cuts.after(d, shell)
+                    end, shell = cuts.after(d, shell, amounts)
                     if store is not None:
                         store(number, d, end)
                     density = [
