@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..backend import floats, types
 from ..errors import InputError
 from ..files import atomic_outputs
 
@@ -185,7 +186,8 @@ def halved(name: str, values: np.ndarray, warnings: list[str]) -> np.ndarray:
             f"{name}: its largest value is {largest:.3g}; half precision holds up to {LARGEST_HALF:g} (scale "
             "solar_irradiance down)"
         )
-    half = values.astype(np.float16)
+    # By the processor: NumPy takes a hundred times as long for small values.
+    half = types().Float16(floats(values)).numpy().reshape(values.shape)
     bits = half.view(np.uint16)
     small = np.count_nonzero(bits < SMALLEST_NORMAL) - np.count_nonzero(values == 0.0)
     small /= max(np.count_nonzero(bits), 1)

@@ -31,12 +31,9 @@ TABLE = {"single_mie_scattering": "single_mie", "higher_order_scattering": "high
 
 def textures(tables: ClientTables, warnings: list[str]) -> dict[str, np.ndarray]:
     """The five tables as half RGBA texels."""
-    found = {}
-    for name in ROLES:
-        table = getattr(tables, TABLE.get(name, name))
-        alpha = tables.single_mie[..., 0].astype(np.float16) if name == "scattering" else None
-        found[name] = packed(halved(name, table, warnings), alpha, np.float16)
-    return found
+    half = {name: halved(name, getattr(tables, TABLE.get(name, name)), warnings) for name in ROLES}
+    red = half["single_mie_scattering"][..., 0]
+    return {name: packed(v, red if name == "scattering" else None, np.float16) for name, v in half.items()}
 
 
 def as_stored(tables: ClientTables, warnings: list[str]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
