@@ -10,6 +10,7 @@ as light of orders >= 2: single scattering is exact in files of either kind.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -41,7 +42,8 @@ def fitted_suns(values: np.ndarray, suns: np.ndarray | None = None) -> np.ndarra
     relative errors; none is negative. ``values`` [A, ..., S, C]: the light at ``suns`` [S], all even places from 0 to
     2 n - 2 (the nodes) and some odd ones (half-way between); default: all."""
     suns = np.arange(values.shape[-2]) if suns is None else suns
-    return np.stack([_fitted(_finer(part, suns), 4) for part in values])
+    with ThreadPoolExecutor() as pool:  # NumPy leaves Python's lock to others
+        return np.stack(list(pool.map(lambda part: _fitted(_finer(part, suns), 4), values)))
 
 
 def _finer(values: np.ndarray, suns: np.ndarray) -> np.ndarray:
