@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ._trees import flat, like
 from .errors import InputError
 
 _NAMES = ("llvm", "cuda")
@@ -177,20 +178,63 @@ def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
 def evaluated(buffer: Any) -> Any:
     """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
 
-    Several Floats in a list are evaluated together, in one kernel if they are of one width.
+    Several Floats in a list are evaluated together, in one kernel if they are of one width; so are their derivatives.
 
     Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
     the process ("dirty variable").
     """
     import drjit as dr
 
-    if isinstance(buffer, list):
-        dr.eval(buffer)
-        return [evaluated(one) for one in buffer]
-    if dr.grad_enabled(buffer):
-        return dr.custom(_evaluating(), buffer)
+    if not isinstance(buffer, list):
+        return evaluated([buffer])[0]
     dr.eval(buffer)
-    return buffer
+    return together(buffer)
+
+
+def together(values: list[Any]) -> list[Any]:
+    """The same Floats, whose derivatives are evaluated together when they come by: in one kernel if they are of one
+    width. One by one, each would run everything that they have in common once more."""
+    import drjit as dr
+
+    values, places = list(values), [i for i, value in enumerate(values) if dr.grad_enabled(value)]
+    if places:
+        for i, value in zip(places, dr.custom(_together(), [values[i] for i in places]), strict=True):
+            values[i] = value
+    return values
+
+
+def spread(numbers: list[Any], width: int) -> list[Any]:
+    """Floats of width 1 as Floats of ``width``, for a kernel that uses them in every lane: their derivatives, sums over
+    the lanes, are evaluated together (see together)."""
+    import drjit as dr
+
+    zero = dr.zeros(types().Float, width)
+    return together([number + zero for number in numbers])
+
+
+def sum_loop(
+    state: tuple[Any, ...], condition: Callable[..., Any], body: Callable[..., Any], shared: Any, label: str
+) -> tuple[Any, ...]:
+    """A loop that only adds to its state, so that derivatives pass through it forwards and backwards with nothing kept.
+
+    ``body`` and ``condition`` take the state; ``body`` after it ``shared``, lists and dictionaries of arrays of the
+    loop's width, which it may use. Those that carry derivatives go through the loop as part of its state: the
+    derivatives of what a body takes from outside are summed in memory instead, atomically, at every turn.
+    """
+    import drjit as dr
+
+    leaves = flat(shared)
+    places = [i for i, leaf in enumerate(leaves) if dr.grad_enabled(leaf)]
+
+    def turn(*arguments: Any) -> tuple[Any, ...]:
+        *own, carried = arguments
+        inside = list(leaves)
+        for i, leaf in zip(places, carried, strict=True):
+            inside[i] = leaf
+        return (*body(*own, like(shared, inside)), carried)
+
+    start = (*state, [leaves[i] for i in places])
+    return dr.while_loop(start, lambda *a: condition(*a[:-1]), turn, max_iterations=-1, label=label)[:-1]
 
 
 @contextmanager
@@ -211,25 +255,24 @@ def traversing() -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _evaluating() -> type:
+def _together() -> type:
     import drjit as dr
 
-    class Evaluated(dr.CustomOp):
-        def eval(self, buffer: Any) -> Any:
-            dr.eval(buffer)
-            return buffer
+    class Together(dr.CustomOp):
+        def eval(self, values: list[Any]) -> list[Any]:
+            return list(values)
 
         def forward(self) -> None:
-            grad = self.grad_in("buffer")
-            dr.eval(grad)
-            self.set_grad_out(grad)
+            grads = self.grad_in("values")
+            dr.eval(grads)
+            self.set_grad_out(grads)
 
         def backward(self) -> None:
-            grad = self.grad_out()
-            dr.eval(grad)
-            self.set_grad_in("buffer", grad)
+            grads = self.grad_out()
+            dr.eval(grads)
+            self.set_grad_in("values", grads)
 
         def name(self) -> str:
-            return "evaluated"
+            return "together"
 
-    return Evaluated
+    return Together

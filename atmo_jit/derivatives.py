@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ._trees import flat, like
 from .atmosphere import Atmosphere
 from .backend import doubles, floats
 from .errors import InputError
@@ -28,8 +29,6 @@ from .parameters import (
     check_names,
     described,
     directions,
-    flat,
-    like,
     per_wavelength,
     replaced,
     tangent,

@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ._trees import flat
 from .backend import doubles, evaluated, traversing, types
-from .parameters import VIEWS, flat
+from .parameters import VIEWS
 from .recording import Recordings, copied
 from .sky import Sky
 

@@ -15,8 +15,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ._trees import flat, like
 from .atmosphere import Atmosphere
-from .backend import floats, parameter, table
+from .backend import floats, parameter, spread, table
 from .phase import CornetteShanks, HenyeyGreenstein, RayleighPhase
 from .profile import Exponential, Tabulated, Tent
 from .resolution import moments_of
@@ -126,7 +127,7 @@ class Optics:
     def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
         """Everything that kernels read of an atmosphere, with phase moments up to ``degrees``."""
         return {
-            **{name: getattr(self, name) for name in _VALUES},
+            **self.used,
             "phase_tables": {phase_degree: self.phase_table(phase_degree)},
             "moment_tables": {degree: self.phase_moments(degree) for degree in degrees},
         }
@@ -136,6 +137,22 @@ class Optics:
         other = copy(self)
         vars(other).update(values)
         return other
+
+    def spread(self, width: int) -> Optics:
+        """These optics for a kernel of ``width`` lanes: derivatives by all values are summed over the lanes together
+        (backend.spread)."""
+        leaves = flat(self.used)
+        places = [i for i, leaf in enumerate(leaves) if dr.grad_enabled(leaf) and len(leaf) == 1]
+        if not places or width == 1:
+            return self
+        for i, leaf in zip(places, spread([leaves[i] for i in places], width), strict=True):
+            leaves[i] = leaf
+        return self.with_values(like(self.used, leaves))
+
+    @property
+    def used(self) -> dict[str, Any]:
+        """Every value that is no table."""
+        return {name: getattr(self, name) for name in _VALUES}
 
     def densities(self, h: Any) -> list[Any]:
         """Relative density of every constituent at altitude ``h`` (m)."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ._trees import flat
 from .atmosphere import Atmosphere
 from .errors import AtmosphereError, InputError
 from .optics import Optics
@@ -85,27 +86,6 @@ def tangent(
     before, after, apart = moved(optics.atmosphere, name, direction)
     low, high = (flat(optics.numbers(air, degrees, phase_degree)) for air in (before, after))
     return [(np.asarray(b, float) - np.asarray(a, float)) / apart for a, b in zip(low, high, strict=True)]
-
-
-def flat(tree: Any) -> list[Any]:
-    """The leaves of nested dictionaries and lists."""
-    if isinstance(tree, dict):
-        return [leaf for part in tree.values() for leaf in flat(part)]
-    if isinstance(tree, list):
-        return [leaf for part in tree for leaf in flat(part)]
-    return [tree]
-
-
-def like(tree: Any, leaves: list[Any]) -> Any:
-    """The tree with other leaves."""
-    remaining = iter(leaves)
-
-    def build(part: Any) -> Any:
-        if isinstance(part, dict):
-            return {key: build(p) for key, p in part.items()}
-        return [build(p) for p in part] if isinstance(part, list) else next(remaining)
-
-    return build(tree)
 
 
 def replaced(

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import row, table, table_of, tables_of, types
+from .backend import row, sum_loop, table, table_of, tables_of, types
 from .optics import Optics
 from .paths import Paths, Points, points_along
 from .quadrature import gauss_legendre, running_integral
@@ -100,18 +100,20 @@ class PathWeights:
         kinds, channels = len(optics.constituents), optics.channel_count
         visit = dr.arange(t.UInt, len(paths.station))
         sharing = points.shares.shape[1]
+        optics = optics.spread(dr.width(visit))
         bounds = row(d.bounds, device.station, sharing + 1)
 
-        def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        def add(i: Any, sums: list[Any], values: dict[str, Any]) -> tuple[Any, list[Any]]:
+            here = optics.with_values(values)
             # The farther along the path a point lies, the farther behind it this station is.
             place = t.UInt(sharing - 1)
             for bound in bounds[1:-1]:
                 place = dr.select(i >= bound, place - 1, place)
             weight = dr.gather(t.Float, d.shares, i * sharing + place)
             density, column = row(at.density, i, kinds), row(at.column, i, kinds)
-            seen = [dr.exp(-depth) * weight for depth in optics.optical_depths(column)]
+            seen = [dr.exp(-depth) * weight for depth in here.optical_depths(column)]
             return i + 1, [
-                dr.fma(optics.scattering[k][c] * density[k], seen[c], sums[n * channels + c])
+                dr.fma(here.scattering[k][c] * density[k], seen[c], sums[n * channels + c])
                 for n, k in enumerate(optics.scatterers)
                 for c in range(channels)
             ]
@@ -119,7 +121,7 @@ class PathWeights:
         sums = [dr.zeros(t.Float, dr.width(visit)) for _ in range(len(optics.scatterers) * channels)]
         if sums:
             state, end = (bounds[0] + 0, sums), bounds[-1]
-            _, sums = dr.while_loop(state, lambda i, _: i < end, add, max_iterations=-1, label="weights")
+            _, sums = sum_loop(state, lambda i, _: i < end, add, optics.used, "weights")
         depths = [0.0] * channels
         if kinds:
             depths = optics.optical_depths(row(at.whole, device.ray, kinds))

@@ -111,7 +111,7 @@ class Projection:
         def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             weight = dr.gather(t.Float, self._basis, rest * count + i)
             place = first + i * (blocks * TOGETHER * per_sun)
-            values = [packet(harmonics, place + s * per_sun, size) for s in range(TOGETHER)]
+            values = [packet(harmonics, place + s * per_sun, size, alone=True) for s in range(TOGETHER)]
             return i + 1, [
                 dr.fma(weight, values[s][c], sums[s * channels + c]) for s in range(TOGETHER) for c in range(channels)
             ]

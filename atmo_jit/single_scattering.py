@@ -7,7 +7,20 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, padded, parameter, row, row_size, stored, table, table_of, tables_of, types
+from .backend import (
+    floats,
+    packet,
+    padded,
+    parameter,
+    row,
+    row_size,
+    stored,
+    sum_loop,
+    table,
+    table_of,
+    tables_of,
+    types,
+)
 from .column import SunColumns
 from .field import Field
 from .geometry import safe_sine
@@ -53,6 +66,7 @@ class Sunbeam:
             held = keeper.kept(("sunbeams", paths.refine), beams)
         lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
         seen, *column = row(held, lane, 1 + kinds)
+        optics = optics.spread(dr.width(lane))
         depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
         light = [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)]
         self._table = stored(light, lane, self.size)
@@ -65,7 +79,7 @@ class Sunbeam:
         cell = dr.minimum(t.UInt(dr.maximum(x, 0.0)), self.COSINES - 2)
         f = x - t.Float(cell)
         index = level * self.COSINES + cell
-        low, high = packet(self._table, index, self.size, up), packet(self._table, index + 1, self.size, up)
+        low, high = (packet(self._table, index + i, self.size, up, alone=True) for i in (0, 1))
         return [dr.fma(f, b - a, a) for a, b in zip(low, high, strict=True)][: self.optics.channel_count]
 
 
@@ -108,7 +122,8 @@ def beam_along(
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
     def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
-        weight, level = row(weights.scattered, i, kinds * channels) if kinds else [], dr.gather(t.UInt, device.level, i)
+        weight = row(weights.scattered, i, kinds * channels, alone=True) if kinds else []
+        level = dr.gather(t.UInt, device.level, i)
         lights = [beam.at(level, mu) for mu in turned(i)]
         new = [
             [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
@@ -172,14 +187,15 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
     steps = grid.kept(("azimuths", azimuths, few), rule)
     width = kinds * channels
 
-    def by_azimuth(buffer: Any, size: int) -> list[tuple[Any, ...]]:
+    def by_azimuth(buffer: Any, size: int) -> list[list[Any]]:
         groups = (azimuth_rows(buffer, lane, i, few, size) for i in range(few // azimuths_together(few)))
-        return list(zip(*(values for group in groups for values in group), strict=True))
+        return [list(v) for v in zip(*(values for group in groups for values in group), strict=True)]
 
     held, lit = by_azimuth(scattered, width) if kinds else [], by_azimuth(ground, channels)
     phases = optics.phase_table(r.phase_degree)
 
-    def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+    def add(j: Any, sums: list[Any], glows: list[Any]) -> tuple[Any, list[Any]]:
+        held, lit = glows
         cos_phi, *taps = row(steps, j, 1 + few)
         nu = dr.clip(dr.fma(across, cos_phi, along), -1.0, 1.0)
         values = [dr.maximum(_dot(taps, part), 0.0) for part in lit]
@@ -195,7 +211,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
 
     zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((degree + 1) * channels)]
     end = dr.opaque(t.UInt, azimuths, 1)
-    _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="phases")
+    _, sums = sum_loop((t.UInt(0), zero), lambda j, _: j < end, add, [held, lit], "phases")
     return stored_harmonics(sums, channels, azimuths)
 
 
@@ -226,6 +242,7 @@ def ground_light(optics: Optics, columns: SunColumns, rays: Rays, field: Field) 
     h = dr.zeros(types().Float, dr.width(mu_s))
     dr.make_opaque(h, mu_s)
     light = horizontal_irradiance(optics, columns, field, h, mu_s, reflected=True)
+    optics = optics.spread(dr.width(mu_s))
     return [
         dr.select(rays.ground, albedo * dr.inv_pi * (sun + sky), 0.0)
         for albedo, sun, sky in zip(optics.albedo, *light, strict=True)
@@ -234,6 +251,7 @@ def ground_light(optics: Optics, columns: SunColumns, rays: Rays, field: Field) 
 
 def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> list[Any]:
     """Irradiance of direct sunlight on a horizontal surface facing up at altitude ``h``, per channel."""
+    optics = optics.spread(dr.width(h, mu_s))
     cosine = disc_cosine(mu_s, optics.sun_radius)
     depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
     return [solar * cosine * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
