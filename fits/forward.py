@@ -81,6 +81,11 @@ class SkyModel:
         self._lights.clear()
         self._skies.clear()
 
+    def too_coarse(self, values: Values) -> bool:
+        """Whether the resolution in use was chosen for an atmosphere that asks for less than this."""
+        needed, used = Resolution.suited(self.atmosphere.replace(values), self.tolerance), self._resolution
+        return needed.first_degree > used.first_degree or needed.altitudes > used.altitudes
+
     def strays(self, values: Values) -> bool:
         """Whether the nodes in use were placed for much thinner or thicker air."""
         if self._layout is None:

@@ -109,7 +109,10 @@ def _light_of(sky: Sky) -> Any:
 
 
 def _shells(sky: Sky) -> Shells:
+    """Those of the most opaque atmosphere on the nodes."""
     shells = Shells(sky.solutions[0].optics)
+    breaks = np.array(sky.solutions[0].optics.breaks_m)
+    at, under = (sky.grid.extinction_bound(h) for h in (breaks, breaks * (1.0 - 1e-6)))
+    shells.densest = floats(np.maximum(at[:-1], under[1:]))
     shells.rule(NODES)
-    dr.make_opaque(shells.breaks, shells.densest)
     return shells

@@ -194,7 +194,8 @@ def test_a_measured_sky_is_followed(reference):
     arrays = scan(reference / "kider2014", "2013-05-27___11.45.00")
     report = result(fit(observations(arrays), FitConfig.load(CONFIG)))
     assert report["converged"] and report["residual_robust"] <= 0.05
-    assert report["rmse"] <= 7e-3 and report["relative_rms"] <= 0.045
+    # All 81 directions, the first of them as published comparisons have it.
+    assert report["rmse_with_masked"] <= 7e-3 and report["relative_rms_with_masked"] <= 0.045
     assert 0.105 <= report["derived"]["tau_440"] <= 0.145
     assert 0.58 <= report["derived"]["asymmetry_440"] <= 0.68
     assert report["nuisance"]["sun_azimuth"]["value"] == pytest.approx(-13.0, abs=1.5)
