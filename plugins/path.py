@@ -26,6 +26,7 @@ from .volpath import mis_weight, unpolarized
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
+BEFORE = 0.999  # of the way to a shape: light is scattered before it
 SCALES = ("sun_scale", "sky_scale")
 TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
@@ -332,15 +333,25 @@ class AtmospherePath:
             return part.light
         toward = light.toward_sun(sampler.next_2d(active))
         start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
-        missing = air.shade(
-            part,
-            start,
-            end,
-            sampler.next_1d(active),
-            self.shaft_samples,
-            lambda distance: self._lit(scene, ray(distance), toward, active),
-        )
+
+        def lit(distance: Any, samples: Any = None, path: Any = None, cosine: Any = None) -> Any:
+            origin = ray(distance)
+            if samples is not None:
+                origin = self._scattered_at(scene, mi.Ray3f(origin, ray.d), samples, path, cosine, active)
+            return self._lit(scene, origin, toward, active)
+
+        samples = [sampler.next_1d(active) for _ in range(4)]
+        missing = air.shade(part, start, end, samples, self.shaft_samples, lit)
         return [a - b for a, b in zip(part.light, missing, strict=True)]
+
+    def _scattered_at(self, scene: Any, ray: Any, samples: list[Any], path: Any, cosine: Any, active: Any) -> Any:
+        """Where light that is scattered along a ray, back to its origin, was scattered before: a free ``path`` away in
+        the mean, in front of shapes."""
+        w = mi.Frame3f(ray.d).to_world(henyey_greenstein(mi.Point2f(samples[0], samples[1]), cosine))
+        there = mi.Ray3f(ray.o, w)
+        there.maxt = -path * dr.log(1.0 - samples[2])
+        hit = scene.ray_intersect_preliminary(there, active=active)
+        return there(dr.select(hit.is_valid(), BEFORE * hit.t, there.maxt))
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
@@ -387,3 +398,13 @@ class AtmospherePath:
 def products(one: list[Any], other: list[Any]) -> list[Any]:
     """Wavelength by wavelength."""
     return [a * b for a, b in zip(one, other, strict=True)]
+
+
+def henyey_greenstein(sample: Any, g: Any) -> Any:
+    """A direction about the z axis from Henyey and Greenstein's phase function with asymmetry ``g`` >= 0."""
+    steep = dr.maximum(g, 1e-3)
+    root = (1.0 - steep * steep) / dr.fma(2.0 * steep, sample.x, 1.0 - steep)
+    z = dr.clip((1.0 + steep * steep - root * root) / (2.0 * steep), -1.0, 1.0)
+    sin, cos = dr.sincos(2.0 * dr.pi * sample.y)
+    across = dr.safe_sqrt((1.0 - z) * (1.0 + z))
+    return mi.Vector3f(across * cos, across * sin, z)
