@@ -151,18 +151,24 @@ class Airlight:
         return [e * factor * dr.exp(-depth) for e, depth in zip(optics.solar, depths, strict=True)]
 
     def shade(
-        self, part: Stretch, start: Any, end: Any, samples: Any, most: int, lit: Callable[..., Any]
+        self,
+        part: Stretch,
+        start: Any,
+        end: Any,
+        samples: Any,
+        most: int,
+        lit: Callable[[Any], Any],
+        around: Callable[..., Any],
     ) -> list[Any]:
         """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it.
 
         They can do so only between the distances ``start`` and ``end`` (scene units). There up to ``most`` points are
         drawn, fewer where little is scattered: one from each of as many parts of equal weight exp(-distance x
         extinction at the start), by the first of the four random numbers ``samples``. ``lit`` says whether the sun is
-        seen (1 or 0) from a distance along the ray and, given three more random numbers, the mean free path (scene
-        units) and the mean cosine of a scattering, from a place that light was last scattered at on its way to there.
-
-        The former keeps away order 1, and of higher orders what comes from so near the sun that the same shapes are in
-        its way (:func:`beam_extinction`), the latter the rest: one such place stands for all."""
+        seen (1 or 0) from a distance along the ray. That keeps away order 1, and of higher orders what comes from so
+        near the sun that the same shapes are in its way (:func:`beam_extinction`). ``around`` says how much of the rest
+        is missing there, given three more random numbers, light's mean free path (scene units), the mean cosine of its
+        scatterings, and how bright sunlit surfaces are beside the air."""
         rays, scale = part.rays, self.globe.scale
         optics = self.bands[0].optics
         first = dr.clip(start * (1.0 / scale) - part.gap, 0.0, rays.stop)
@@ -176,7 +182,9 @@ class Airlight:
         count = dr.select(length > 0.0, count, 0.0)
         phases = [{k: band.optics.phase_values(k, rays.nu) for k in band.optics.scatterers} for band in self.bands]
         # What is scattered once more changes slowly: the field is asked once, in the middle.
-        later = self._later(rays, first - dr.log(dr.fma(0.5, rest - 1.0, 1.0)) / rate, length > 0.0)
+        middle = first - dr.log(dr.fma(0.5, rest - 1.0, 1.0)) / rate
+        later = self._later(rays, middle, length > 0.0)
+        surfaces = None if later is None else self._surfaces(rays, middle, later)
 
         def part_of(i: Any, d: Any, amounts: list[Any], sums: list[Any]) -> tuple[Any, ...]:
             jitter, *others = (u + i * step for u, step in zip(samples, STEPS, strict=True))
@@ -190,7 +198,8 @@ class Airlight:
             dark = 1.0 - lit(place)
             shining = visible_sun(optics, h, r, mu_s)
             path = self._mean_path(self._guide.densities(h)) * scale
-            around = 0.0 if later is None else 1.0 - lit(place, [u - dr.floor(u) for u in others], path, self._cosine)
+            others = [u - dr.floor(u) for u in others]
+            less = 0.0 if later is None else around(place, others, path, self._cosine, surfaces)
             new = []
             for b, (band, beam, values) in enumerate(zip(self.bands, self._beams, phases, strict=True)):
                 o = band.optics
@@ -204,8 +213,8 @@ class Airlight:
                     for n, k in enumerate(o.scatterers):
                         lost = values[k][c] * beams * dark
                         if later is not None:
-                            others_ = dr.maximum(later[b][n][c] - values[k][c] * (beams - alone), 0.0)
-                            lost = dr.fma(others_, around, lost)
+                            wide = dr.maximum(later[b][n][c] - values[k][c] * (beams - alone), 0.0)
+                            lost = dr.fma(wide, less, lost)
                         total += o.scattering[k][c] * here[k] * lost
                     new.append(total * seen)
             return i + 1.0, there, amounts, [a + b for a, b in zip(sums, new, strict=True)]
@@ -226,10 +235,21 @@ class Airlight:
         azimuth = relative_azimuth(mu, mu_s, rays.nu)
         return [source.scattered(h, mu_s, mu, azimuth, active) for source in self._sources]
 
+    def _surfaces(self, rays: Rays, distance: Any, later: list[list[list[Any]]]) -> Any:
+        """Radiance of sunlit surfaces over that of the air around: those of the ground's albedo, horizontal, and at
+        most 1."""
+        band, (light, *_) = self.bands[0], later
+        optics = band.optics
+        h, r, mu_s = point_along(optics, rays, distance)
+        sun = self._sunlight(band, h, mu_s, visible_sun(optics, h, r, mu_s) * dr.maximum(mu_s, 0.0) * dr.inv_pi)
+        air = sum(values[c] for values in light for c in range(optics.channel_count)) * (1.0 / len(light))
+        own = sum(a * s for a, s in zip(optics.albedo, sun, strict=True))
+        grey = sum(optics.albedo) * (1.0 / optics.channel_count)
+        return dr.clip(own / dr.maximum(air, 1e-30) + grey, 0.0, 1.0)
+
     def _mean_path(self, densities: list[Any]) -> Any:
         """Mean free path (m) of light between scatterings that turn it, mean over the wavelengths of a band."""
-        beam = self._guide_beam
-        total = sum(sum(e) * (1.0 / len(e)) * n for e, n in zip(beam, densities, strict=True))
+        total = sum(sum(e) * (1.0 / len(e)) * n for e, n in zip(self._guide.extinction, densities, strict=True))
         return 1.0 / dr.maximum(total, LEAST_EXTINCTION)
 
     def _columns(self, rays: Rays, start: Any, end: Any, amounts: list[Any], parts: int) -> list[Any]:
@@ -268,7 +288,6 @@ def mean_cosine(band: Any) -> Any:
     for k in optics.scatterers:
         phase = optics.constituents[k].phase
         for c, i in enumerate(optics.indices):
-            _, chi_1, chi_2 = moments_of(phase.at(int(i)), 2)[:3]
             amount = float(np.array(optics.scattering[k][c] * density[k]).ravel()[0])
-            turned, forward = turned + amount * (1.0 - chi_2), forward + amount * (chi_1 - chi_2)
+            turned, forward = turned + amount, forward + amount * float(moments_of(phase.at(int(i)), 1)[1])
     return number(forward / turned if turned > 0.0 else 0.0)
