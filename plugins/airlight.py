@@ -16,15 +16,18 @@ import numpy as np
 from atmo_jit.backend import row
 from atmo_jit.bake.source import SourceTable
 from atmo_jit.geometry import altitude_along, hits_ground
-from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, visible_sun
+from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, relative_azimuth, visible_sun
 from atmo_jit.quadrature import gauss_legendre
+from atmo_jit.resolution import moments_of
 from atmo_jit.single_scattering import disc_cosine
 from atmo_jit.sky import Sky
 
+from .exposed import number
 from .globe import Globe
 
 NODES = 2  # of each piece of a ray; `python -m bench.airlight` has what that costs beside the four of Sky.rays
-GOLDEN = 0.6180339887
+# Of random numbers from point to point of a ray: powers of the inverse of the root of x^5 = x + 1 (M. Roberts 2018).
+STEPS = [1.1673039782614187**-n for n in range(1, 5)]
 QUADRATURE = gauss_legendre(4)
 FIRST_PARTS = 4  # of the way to where shadows may begin
 FULL_DEPTH = 0.25  # optical depth from which a stretch gets all of its points
@@ -58,7 +61,9 @@ class Airlight:
         for shells in self._shells:
             shells.rule(NODES)
             dr.eval(shells.densest)
-        self._guide = self.bands[0].optics  # says where shadows are looked for
+        # These say where shadows are looked for.
+        self._guide, self._guide_beam = self.bands[0].optics, self._beams[0]
+        self._cosine = mean_cosine(self.bands[0])
         self.count = len(sky.atmosphere.wavelengths_nm)
         ground = [band.optics.largest_extinction(band.optics.densities(mi.Float(0.0))) for band in self.bands]
         self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
@@ -146,15 +151,24 @@ class Airlight:
         return [e * factor * dr.exp(-depth) for e, depth in zip(optics.solar, depths, strict=True)]
 
     def shade(
-        self, part: Stretch, start: Any, end: Any, sample: Any, most: int, lit: Callable[[Any], Any]
+        self,
+        part: Stretch,
+        start: Any,
+        end: Any,
+        samples: Any,
+        most: int,
+        lit: Callable[[Any], Any],
+        around: Callable[..., Any],
     ) -> list[Any]:
-        """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it: of order 1, and of
-        higher orders what comes from so near the sun that the same shapes are in its way (:func:`beam_extinction`).
+        """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it.
 
         They can do so only between the distances ``start`` and ``end`` (scene units). There up to ``most`` points are
         drawn, fewer where little is scattered: one from each of as many parts of equal weight exp(-distance x
-        extinction at the start), by the random number ``sample``. ``lit`` says of distances where the sun is seen (1 or
-        0)."""
+        extinction at the start), by the first of the four random numbers ``samples``. ``lit`` says whether the sun is
+        seen (1 or 0) from a distance along the ray. That keeps away order 1, and of higher orders what comes from so
+        near the sun that the same shapes are in its way (:func:`beam_extinction`). ``around`` says how much of the rest
+        is missing there, given three more random numbers, light's mean free path (scene units), the mean cosine of its
+        scatterings, and how bright sunlit surfaces are beside the air."""
         rays, scale = part.rays, self.globe.scale
         optics = self.bands[0].optics
         first = dr.clip(start * (1.0 / scale) - part.gap, 0.0, rays.stop)
@@ -167,30 +181,76 @@ class Airlight:
         count = dr.clip(dr.ceil(most * (1.0 - rest) / FULL_DEPTH), 1.0, float(most))
         count = dr.select(length > 0.0, count, 0.0)
         phases = [{k: band.optics.phase_values(k, rays.nu) for k in band.optics.scatterers} for band in self.bands]
+        # What is scattered once more changes slowly: the field is asked once, in the middle.
+        middle = first - dr.log(dr.fma(0.5, rest - 1.0, 1.0)) / rate
+        later = self._later(rays, middle, length > 0.0)
+        surfaces = None if later is None else self._surfaces(rays, middle, later)
 
         def part_of(i: Any, d: Any, amounts: list[Any], sums: list[Any]) -> tuple[Any, ...]:
-            jitter = sample + i * GOLDEN
+            jitter, *others = (u + i * step for u, step in zip(samples, STEPS, strict=True))
             s = (i + (jitter - dr.floor(jitter))) / count
             left = dr.fma(s, rest - 1.0, 1.0)
             there = dr.minimum(first - dr.log(left) / rate, first + length)
             amounts = self._columns(rays, d, there, amounts, 1)
             h, r, mu_s = point_along(optics, rays, there)
             inverse_density = (1.0 - rest) / (rate * left * count)
-            dark = (1.0 - lit((part.gap + there) * scale)) * visible_sun(optics, h, r, mu_s) * inverse_density
+            place = (part.gap + there) * scale
+            dark = 1.0 - lit(place)
+            shining = visible_sun(optics, h, r, mu_s)
+            path = self._mean_path(self._guide.densities(h)) * scale
+            others = [u - dr.floor(u) for u in others]
+            less = 0.0 if later is None else around(place, others, path, self._cosine, surfaces)
             new = []
-            for band, beam, values in zip(self.bands, self._beams, phases, strict=True):
+            for b, (band, beam, values) in enumerate(zip(self.bands, self._beams, phases, strict=True)):
                 o = band.optics
                 here, toward = o.densities(h), band.columns.toward(h, mu_s)
-                for c, depth in enumerate(o.optical_depths(amounts)):
-                    sun_depth = sum(e[c] * n for e, n in zip(beam, toward, strict=True))
-                    scattered = sum(o.scattering[k][c] * values[k][c] * here[k] for k in o.scatterers)
-                    new.append(scattered * dr.exp(-depth - sun_depth) * dark * o.solar[c])
+                depths = zip(o.optical_depths(amounts), o.optical_depths(toward), strict=True)
+                for c, (depth, whole) in enumerate(depths):
+                    seen = dr.exp(-depth) * inverse_density
+                    beams = shining * o.solar[c] * dr.exp(-sum(e[c] * n for e, n in zip(beam, toward, strict=True)))
+                    alone = shining * o.solar[c] * dr.exp(-whole)
+                    total = 0.0
+                    for n, k in enumerate(o.scatterers):
+                        lost = values[k][c] * beams * dark
+                        if later is not None:
+                            wide = dr.maximum(later[b][n][c] - values[k][c] * (beams - alone), 0.0)
+                            lost = dr.fma(wide, less, lost)
+                        total += o.scattering[k][c] * here[k] * lost
+                    new.append(total * seen)
             return i + 1.0, there, amounts, [a + b for a, b in zip(sums, new, strict=True)]
 
         zero = dr.zeros(mi.Float, dr.width(first))
         state = (zero + 0.0, first + 0.0, amounts, [zero + 0.0 for _ in range(self.count)])
         *_, sums = dr.while_loop(state, lambda i, *_: i < count, part_of, label="shafts")
         return sums
+
+    def _later(self, rays: Rays, distance: Any, active: Any) -> list[list[list[Any]]] | None:
+        """Integral of phase function times radiance of later orders at a distance (m): [band][scatterer][channel];
+        None: there is none."""
+        if any(source is None for source in self._sources):
+            return None
+        optics = self.bands[0].optics
+        h, r, mu_s = point_along(optics, rays, distance)
+        mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -1.0, 1.0)
+        azimuth = relative_azimuth(mu, mu_s, rays.nu)
+        return [source.scattered(h, mu_s, mu, azimuth, active) for source in self._sources]
+
+    def _surfaces(self, rays: Rays, distance: Any, later: list[list[list[Any]]]) -> Any:
+        """Radiance of sunlit surfaces over that of the air around: those of the ground's albedo, horizontal, and at
+        most 1."""
+        band, (light, *_) = self.bands[0], later
+        optics = band.optics
+        h, r, mu_s = point_along(optics, rays, distance)
+        sun = self._sunlight(band, h, mu_s, visible_sun(optics, h, r, mu_s) * dr.maximum(mu_s, 0.0) * dr.inv_pi)
+        air = sum(values[c] for values in light for c in range(optics.channel_count)) * (1.0 / len(light))
+        own = sum(a * s for a, s in zip(optics.albedo, sun, strict=True))
+        grey = sum(optics.albedo) * (1.0 / optics.channel_count)
+        return dr.clip(own / dr.maximum(air, 1e-30) + grey, 0.0, 1.0)
+
+    def _mean_path(self, densities: list[Any]) -> Any:
+        """Mean free path (m) of light between scatterings that turn it, mean over the wavelengths of a band."""
+        total = sum(sum(e) * (1.0 / len(e)) * n for e, n in zip(self._guide.extinction, densities, strict=True))
+        return 1.0 / dr.maximum(total, LEAST_EXTINCTION)
 
     def _columns(self, rays: Rays, start: Any, end: Any, amounts: list[Any], parts: int) -> list[Any]:
         """Column densities (m) of all constituents up to ``end``, given those up to ``start``."""
@@ -219,3 +279,15 @@ def beam_extinction(band: Any, *, scaled: bool) -> list[Any]:
             found[k][c] = found[k][c] - chi[n * count + c] * optics.scattering[k][c]
     dr.eval(found)
     return found
+
+
+def mean_cosine(band: Any) -> Any:
+    """Mean cosine of the scatterings that :func:`beam_extinction` counts, at the ground."""
+    optics, (turned, forward) = band.optics, (0.0, 0.0)
+    density = optics.densities(mi.Float(0.0))
+    for k in optics.scatterers:
+        phase = optics.constituents[k].phase
+        for c, i in enumerate(optics.indices):
+            amount = float(np.array(optics.scattering[k][c] * density[k]).ravel()[0])
+            turned, forward = turned + amount, forward + amount * float(moments_of(phase.at(int(i)), 1)[1])
+    return number(forward / turned if turned > 0.0 else 0.0)

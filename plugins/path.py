@@ -26,6 +26,7 @@ from .volpath import mis_weight, unpolarized
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
+BEFORE = 0.999  # of the way to a shape: light is scattered before it
 SCALES = ("sun_scale", "sky_scale")
 TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
@@ -332,15 +333,46 @@ class AtmospherePath:
             return part.light
         toward = light.toward_sun(sampler.next_2d(active))
         start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
-        missing = air.shade(
-            part,
-            start,
-            end,
-            sampler.next_1d(active),
-            self.shaft_samples,
-            lambda distance: self._lit(scene, ray(distance), toward, active),
-        )
+        samples = [sampler.next_1d(active) for _ in range(4)]
+
+        def lit(distance: Any) -> Any:
+            return self._lit(scene, ray(distance), toward, active)
+
+        def around(distance: Any, *how: Any) -> Any:
+            return self._missing(scene, mi.Ray3f(ray(distance), ray.d), toward, air.globe, active, *how)
+
+        missing = air.shade(part, start, end, samples, self.shaft_samples, lit, around)
         return [a - b for a, b in zip(part.light, missing, strict=True)]
+
+    def _missing(
+        self,
+        scene: Any,
+        ray: Any,
+        toward: Any,
+        globe: Globe,
+        active: Any,
+        samples: list[Any],
+        path: Any,
+        cosine: Any,
+        surfaces: Any,
+    ) -> Any:
+        """How much of the light that is scattered along a ray, back to its origin, is missing because of shapes: 0 or
+        1, as there is sunlight at a place where it may have been scattered before, a free ``path`` away in the mean;
+        if that is on a surface, ``surfaces`` is what sunlight makes of it, there as in the scene without shapes."""
+        by_sun = samples[0] < 0.5
+        u = mi.Point2f(dr.select(by_sun, 2.0 * samples[0], 2.0 * samples[0] - 1.0), samples[1])
+        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(henyey_greenstein(u, cosine))
+        there = mi.Ray3f(ray.o, w)
+        there.maxt = -path * dr.log(1.0 - samples[2])
+        hit = scene.ray_intersect_preliminary(there, active=active)
+        end = there(dr.select(hit.is_valid(), BEFORE * hit.t, there.maxt))
+        covers = hit.is_valid() & (globe.altitude(there(there.maxt)) > 0.0)  # not the ground, which is always there
+        lost = 1.0 - self._lit(scene, end, toward, active) * dr.select(covers, surfaces, 1.0)
+        # More light comes from about the sun. The convolution of two such phase functions, by which the weight has
+        # the mean 1, is another, whose asymmetry is the product of theirs.
+        ahead, sunward = (phase_times_4pi(cosine, dr.dot(w, axis)) for axis in (ray.d, toward))
+        weight = 2.0 * ahead * sunward / (ahead + sunward)
+        return lost * weight / phase_times_4pi(cosine * cosine, dr.dot(ray.d, toward))
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
@@ -387,3 +419,19 @@ class AtmospherePath:
 def products(one: list[Any], other: list[Any]) -> list[Any]:
     """Wavelength by wavelength."""
     return [a * b for a, b in zip(one, other, strict=True)]
+
+
+def henyey_greenstein(sample: Any, g: Any) -> Any:
+    """A direction about the z axis from Henyey and Greenstein's phase function with asymmetry ``g`` >= 0."""
+    steep = dr.maximum(g, 1e-3)
+    root = (1.0 - steep * steep) / dr.fma(2.0 * steep, sample.x, 1.0 - steep)
+    z = dr.clip((1.0 + steep * steep - root * root) / (2.0 * steep), -1.0, 1.0)
+    sin, cos = dr.sincos(2.0 * dr.pi * sample.y)
+    across = dr.safe_sqrt((1.0 - z) * (1.0 + z))
+    return mi.Vector3f(across * cos, across * sin, z)
+
+
+def phase_times_4pi(g: Any, nu: Any) -> Any:
+    """Henyey and Greenstein's phase function times 4 pi."""
+    base = dr.fma(-2.0 * g, nu, dr.fma(g, g, 1.0))
+    return (1.0 - g * g) / (base * dr.sqrt(base))
