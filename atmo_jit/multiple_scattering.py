@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, types
+from .backend import floats, row_size, types
 from .column import SunColumns
 from .field import Field
 from .gather import Gather
@@ -45,11 +45,12 @@ def solve(
     values = optics.values(resolution.degrees, resolution.phase_degree)
     done = steps.start(values, min(AT_ONCE, most))
     later, probes = done["later"], [p.numpy() for p in done["probes"]]
+    dimness = _dimness(done["reference"], grid, optics.channel_count)
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
     for n in range(AT_ONCE, most + 1):
         if orders is None and later:
             shape = (len(probes), grid.shape[0], grid.shape[1], 2, optics.channel_count)
-            weights, error = _extrapolated(np.reshape(probes, shape))
+            weights, error = _extrapolated(np.reshape(probes, shape) * dimness)
             arriving = weights
             if error < resolution.converged * tolerance:
                 break
@@ -238,6 +239,18 @@ def _probe(order: Moments, grid: Grid, reference: Reference) -> Any:
     values = values * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
     dr.eval(values)
     return values
+
+
+def _dimness(reference: dict[str, Any], grid: Grid, channels: int) -> np.ndarray:
+    """The reference [K, S, 1, channels] over that of the altitude that is brightest under the same sun.
+
+    Orders are weighed by their light, not by their quotients over the reference: under a cloud, where order 1 hardly
+    comes, those of the later orders are so large that they alone would count.
+    """
+    altitudes, suns = grid.shape[0], len(grid.first_theta)
+    inverse = np.reshape(reference["inverse"].numpy(), (altitudes, suns, row_size(channels)))
+    inverse = inverse[:, :: grid.first, :channels].astype(np.float64)
+    return (inverse.min(axis=0) / inverse)[:, :, None]
 
 
 def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
