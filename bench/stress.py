@@ -37,6 +37,8 @@ CLEAR = 5.0  # optical depth up to which the twin's quadrature is a truth for sc
 FAINT = 1e-3  # of the brightest single scattering under the same sun: errors of fainter light are relative to this
 Errors = dict[str, np.ndarray]
 
+GRAZING = 1e-6  # planet radii
+
 ABOUT = {
     "not finite": "radiance, transmittance, irradiances: values that are NaN or infinite (count)",
     "negative": "the same: values below 0 (count)",
@@ -137,10 +139,12 @@ def _along(world: Mapping[str, Any], views: dict[str, np.ndarray], solved: Solve
     h, mu = some["altitude_m"], np.cos(np.radians(some["view_zenith_deg"]))
     # To a point that a straight ray reaches without meeting the ground.
     near = np.minimum(np.where(np.isfinite(some["distance_m"]), some["distance_m"], radius), 0.5 * radius)
-    below = (mu < 0.0) & (h - (radius + h) * mu**2 / (1.0 + np.sqrt(1.0 - mu**2)) <= 0.0)
-    near = np.where(below, np.minimum(near, 0.5 * h / np.maximum(-mu, 1e-9)), near)
+    perigee = h - (radius + h) * mu**2 / (1.0 + np.sqrt(1.0 - mu**2))
+    near = np.where((mu < 0.0) & (perigee <= 0.0), np.minimum(near, 0.5 * h / np.maximum(-mu, 1e-9)), near)
+    # Whether a ray grazes the ground or hits it, both ends can tell to single precision only.
+    near = np.where((mu < 0.0) & (np.abs(perigee) < GRAZING * radius), 0.0, near)
     through, first = (solved.rays(some | {"distance_m": part * near})[1] for part in (1.0, 0.5))
-    none = solved.rays(some | {"distance_m": 0.0 * near})
+    none = solved.rays(some | {"distance_m": 0.0 * near}, ground=False)
     mirrored, _ = solved.rays(some | {"azimuth_deg": -some["azimuth_deg"]})
 
     def place(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
