@@ -108,6 +108,14 @@ def packet(buffer: Any, index: Any, count: int, active: Any = True, *, alone: bo
     return [values[i] for i in range(count)]
 
 
+def not_negative(value: Any) -> Any:
+    """max(value, 0) with the derivative from above at 0, where dr.maximum has none: ground that is black, or aerosol
+    that is not there yet, sends the first light when it changes."""
+    import drjit as dr
+
+    return dr.select(value < 0.0, 0.0, value)
+
+
 def padded(channel_count: int) -> int:
     """Floats stored per entry of a table: a packet load wants a power of two."""
     return 4 if channel_count == 3 else channel_count

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, table_of, types, uints
+from .backend import floats, not_negative, packet, row, table_of, types, uints
 from .column import SunColumns
 from .field import Field
 from .gather import contracted, seen, weight_rows
@@ -82,12 +82,12 @@ class Bundle:
         nu = dr.clip(dr.fma(mu, mu_s, safe_sine(mu) * sin_s * cos_phi), -1.0, 1.0)
         channels, kinds = optics.channel_count, len(optics.scatterers)
         parts = _series(once, node, (kinds + 1) * channels, cos_phi)
-        total = [dr.maximum(v, 0.0) for v in parts[kinds * channels :]]
+        total = [not_negative(v) for v in parts[kinds * channels :]]
         for n, k in enumerate(optics.scatterers):
             for c, phase in enumerate(optics.phase_values(k, nu)):
-                total[c] = dr.fma(phase, dr.maximum(parts[n * channels + c], 0.0), total[c])
+                total[c] = dr.fma(phase, not_negative(parts[n * channels + c]), total[c])
         if more is not None:
-            total = [v + dr.maximum(m, 0.0) for v, m in zip(total, _series(more, node, channels, cos_phi), strict=True)]
+            total = [v + not_negative(m) for v, m in zip(total, _series(more, node, channels, cos_phi), strict=True)]
         return total
 
     def _once(
@@ -202,7 +202,7 @@ class Bundle:
             lit = field.irradiance(dr.zeros(t.Float, dr.width(lane)), mu_end, reflected=True)
             share = row(weights.reflected, end, channels)
             sums = [dr.fma(a, b, s) for a, b, s in zip(share, lit, sums, strict=True)]
-        radiance = table_of([dr.maximum(s, 0.0) for s in sums], lane)
+        radiance = table_of([not_negative(s) for s in sums], lane)
 
         def seen_at(node: Any, azimuth: Any) -> list[list[Any]]:
             return [row(radiance, node * azimuths + azimuth, channels)]

@@ -155,12 +155,17 @@ class _Steps:
         return light
 
     def probe(self, light: Any, done: dict[str, Any], n: int) -> np.ndarray:
-        """The moments of order ``n`` of degrees 0 and 1 with m = 0, over the reference: [K, S, 2, channels]."""
+        """The moments of order ``n`` of degrees 0 and 1 with m = 0, [K, S, 2, channels], over the reference where that
+        is brightest under the same sun.
+
+        Not over each altitude's own: under a cloud, where order 1 hardly comes, the quotients of later orders are so
+        large that they alone would count.
+        """
         channels, (altitudes, suns) = self._optics.channel_count, self._grid.shape
         inverse = done["reference"]["inverse"].numpy().reshape(altitudes, len(self._grid.first_theta), -1)
-        inverse = inverse[:, :: self._grid.first, :channels]
+        inverse = inverse[:, :: self._grid.first, :channels].min(axis=0)
         light = Moments(light, *self._degree(n), suns, channels)
-        return np.swapaxes(light.numpy()[:, :2, :suns] * inverse[:, None], 1, 2)
+        return np.swapaxes(light.numpy()[:, :2, :suns] * inverse, 1, 2)
 
     def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
         """What Field holds: moments, sky and reflected irradiance."""

@@ -26,7 +26,7 @@ FEW_CORNERS = 8
 PHASE_NODES = 257
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
 # Scale heights at which rays are cut: the field is asked once between two cuts.
-LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0)
+LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
 # In fog, more: as long as a horizontal ray there has this optical depth.
 FURTHER, THIN = 4.0, 0.05
 RAMP, THICK = 0.25, 4.0

@@ -16,6 +16,7 @@ from .projection import Moments
 
 FINE = 16  # parts of an interval of solved suns; 1.2 e-folds over it are then linear to 0.1 %
 STEEPEST = 1.2  # e-folds of the reference from one solved sun to the next
+DEEPEST = 3.0  # and from one altitude to the next
 
 
 class Reference:
@@ -59,8 +60,16 @@ class Reference:
             fall = steepest * dr.abs(t.Float(sun) - t.Float(i))
             return i + 1, dr.maximum(highest, dr.log(dr.maximum(zeroth, 1e-30)) - fall)
 
+        # Nor does light in a cloud that sunlight does not reach.
+        def level(i: Any, highest: Any) -> tuple[Any, Any]:
+            there = dr.gather(t.Float, by_suns, (i * suns + sun) * channels + channel)
+            return i + 1, dr.maximum(highest, there - DEEPEST * dr.abs(t.Float(k) - t.Float(i)))
+
         lowest = dr.full(t.Float, -100.0, dr.width(lane))
-        _, highest = dr.while_loop((t.UInt(0), lowest), lambda i, _: i < end, steady, label="steady")
+        _, by_suns = dr.while_loop((t.UInt(0), lowest), lambda i, _: i < end, steady, label="steady")
+        dr.eval(by_suns)
+        top = dr.opaque(t.UInt, altitudes, 1)
+        _, highest = dr.while_loop((t.UInt(0), lowest), lambda i, _: i < top, level, label="level")
         self.log, self.inverse = (dr.zeros(t.Float, altitudes * suns * row_size(channels)) for _ in range(2))
         place = node * row_size(channels) + channel
         dr.scatter(self.log, highest, place)

@@ -9,6 +9,7 @@ import numpy as np
 
 from .backend import (
     floats,
+    not_negative,
     packet,
     padded,
     parameter,
@@ -198,14 +199,14 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
         held, lit = glows
         cos_phi, *taps = row(steps, j, 1 + few)
         nu = dr.clip(dr.fma(across, cos_phi, along), -1.0, 1.0)
-        values = [dr.maximum(_dot(taps, part), 0.0) for part in lit]
+        values = [not_negative(_dot(taps, part)) for part in lit]
         if kinds:
             x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
             cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
             f = x - t.Float(cell)
             low, high = (row(phases, cell + i, width, alone=True) for i in (0, 1))
             for i, part in enumerate(held):
-                glow = dr.maximum(_dot(taps, part), 0.0)
+                glow = not_negative(_dot(taps, part))
                 values[i % channels] = dr.fma(glow, dr.fma(f, high[i] - low[i], low[i]), values[i % channels])
         return j + 1, add_harmonics(sums, values, cos_phi)
 

@@ -24,13 +24,16 @@ SCATTERING_PER_M = (1e-9, 1e-1)
 G = 0.99
 ALTITUDE_M = (1e-3, 1e9)
 HORIZON_RAD = 1e-7
-WIDTHS = (1, 1, 1, 2, 3, 3, 4, 5, 8, 64)
+WIDTHS = (1, 1, 1, 1, 1, 2, 2, 3, 3, 3, 3, 3, 3, 4, 4, 5, 5, 8, 16, 64)
 PHASES = ("cornette_shanks", "henyey_greenstein", "rayleigh", "isotropic", "tabulated", "legendre")
 
 
-def extreme_world(rng: Random, *, conservative: bool = False) -> dict[str, Any]:
-    """An atmosphere as contract JSON. ``conservative``: nothing absorbs, and the ground is white."""
-    width = rng.choice(WIDTHS)
+def extreme_world(
+    rng: Random, *, conservative: bool = False, widths: Sequence[int] = WIDTHS
+) -> dict[str, Any]:
+    """An atmosphere as contract JSON. ``conservative``: nothing absorbs, and the ground is white; ``widths``: numbers
+    of wavelengths to choose from."""
+    width = rng.choice(widths)
     radius, height = _log(rng, *RADIUS_M), _log(rng, *SCALE_HEIGHT_M)
     # Beyond ten radii of air the curvature of the planet has no part in anything.
     thickness = min(height * _log(rng, *THICKNESS), 10.0 * radius)

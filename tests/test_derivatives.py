@@ -191,6 +191,19 @@ def test_derivatives_are_finite_where_geometry_is_singular():
     assert np.all(at.jacobian(["mie.scattering_per_m"])["mie.scattering_per_m"][0] > 0.0)
 
 
+def test_a_list_from_one_end_of_its_range_to_the_other():
+    """No common step of all its numbers is allowed."""
+    air = EARTH.replace({"ground_albedo": [0.0, 0.5, 1.0]})
+    views = {name: values[2:3] for name, values in VIEWPOINTS.items()}
+    whole = Linearization(air, views, tolerance=COARSE)
+    by = whole.jacobian(["ground_albedo"])["ground_albedo"]
+    inner = EARTH.replace({"ground_albedo": [0.01, 0.5, 0.99]})
+    near = Linearization(inner, views, tolerance=COARSE).jacobian(["ground_albedo"])["ground_albedo"]
+    assert by == pytest.approx(near, rel=0.02)
+    pulled = whole.vjp({"radiance": 1.0}, ["ground_albedo"])["ground_albedo"]
+    assert pulled == pytest.approx(by[0], rel=1e-3)
+
+
 def test_a_fit_moves_smoothly(at):
     """As long as nodes suit they stay, and the radiance changes as its derivative says; else they are placed anew."""
     step = at.moved({"mie.scattering_per_m": EARTH.get("mie.scattering_per_m") * 1.3, "mie.phase.g": 0.78})

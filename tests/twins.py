@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 LADDER = 9
 """Number of altitudes, besides the profile's own kinks, at which rays are cut into pieces."""
 
+DEEP, LEVELS = 100.0, (1, 2, 3, 4, 6, 8, 10, 13, 16, 20)
+"""Scale heights of air from which on rays are cut at these multiples of the scale height too."""
+
 
 @dataclass(frozen=True)
 class Species:
@@ -108,7 +111,10 @@ class Twin:
             sorted({kink for s in self.species for kink in s.kinks if 0 < kink < self.top} | {self.top})
         )
         rungs = np.r_[1e-4, 1e-3, (np.arange(LADDER + 1) / LADDER) ** 2.2]
-        self.ladder = np.unique([*(self.top * rungs), *self.kinks])
+        blocks = [spec.get("rayleigh") or {}, *(m if isinstance(m := spec.get("mie") or [], Sequence) else [m])]
+        heights = [block["scale_height_m"] for block in blocks if "scale_height_m" in block]
+        levels = [n * height for height in heights for n in LEVELS if self.top > max(DEEP, n) * height]
+        self.ladder = np.unique([*(self.top * rungs), *self.kinks, *levels])
         self.view_rule, self.sun_rule = (legendre.leggauss(count) for count in (nodes, sun_nodes))
 
     def _per_wavelength(self, value: ArrayLike) -> Array:
