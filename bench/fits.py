@@ -151,10 +151,12 @@ def kider(folder: Path, out: Path) -> None:
     for slot in slots:
         arrays = scan(folder, slot)
         np.savez(out / f"{slot}.npz", **arrays)
-        wall, cpu = time.perf_counter(), time.process_time()
-        found = fit(observations(arrays), settings)
+        times = []
+        for _ in range(3):  # at first kernels are traced, then recorded
+            wall, cpu = time.perf_counter(), time.process_time()
+            found = fit(observations(arrays), settings)
+            times.append((time.perf_counter() - wall, time.process_time() - cpu))
         report = result(found)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         (out / f"{slot}.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         derived, nuisance = report["derived"], report["nuisance"]
         errors = [f"residual {100 * report['residual_robust']:.1f} % robust"]
@@ -167,7 +169,7 @@ def kider(folder: Path, out: Path) -> None:
         print(
             f"    tau_440 {derived['tau_440']:.3f}, asymmetry_440 {derived['asymmetry_440']:.3f}, sun azimuth "
             f"{nuisance['sun_azimuth']['value']:+.1f} deg, calibration {nuisance['calibration']['value']:.3f}; "
-            f"{wall:.1f} s, {cpu:.1f} CPU s; {report['reason']}"
+            f"{times[-1][0]:.1f} s, {times[-1][1]:.1f} CPU s, first {times[0][1]:.1f} CPU s; {report['reason']}"
         )
         for sentence in report["not_identifiable"]:
             print(f"    {sentence}")

@@ -200,3 +200,21 @@ def test_a_measured_sky_is_followed(reference):
     assert 0.58 <= report["derived"]["asymmetry_440"] <= 0.68
     assert report["nuisance"]["sun_azimuth"]["value"] == pytest.approx(-13.0, abs=1.5)
     assert any("single_scattering_albedo is not identifiable" in text for text in report["not_identifiable"])
+
+
+@pytest.mark.slow
+def test_the_path_tracer_takes_the_bias_of_coarse_tables_away():
+    """Tables at a tolerance of 0.2 put g many standard errors off; one step with a path-traced picture leads back."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    from atmo_jit.fits.recover_aerosol import HazySky, recover
+    from atmo_jit.plugins import register
+
+    register()
+    summary, _ = recover(HazySky(), 64, 64, 2, tolerance=0.2)
+    assert abs(summary["off_in_standard_errors"][1]) > 4.0
+    step = summary["refined"]
+    for i, (value, truth) in enumerate(zip(step["values"], summary["truth"], strict=True)):
+        error = np.hypot(summary["standard_errors"][i], step["noise_of_the_step"][i])
+        assert step["noise_of_the_step"][i] < summary["standard_errors"][i]
+        assert abs(value - truth) < 3.0 * error
