@@ -25,7 +25,7 @@ from ._fields import NOT_NEGATIVE, number
 from .atmosphere import Atmosphere
 from .errors import AtmosphereError
 
-__all__ = ["REFRACTIVITY", "apparent_zenith", "bending"]
+__all__ = ["REFRACTIVITY", "apparent_zenith", "bending", "lift"]
 
 REFRACTIVITY = 2.777e-4  # n - 1 of air at 288.15 K, 1013.25 hPa and 550 nm: Peck and Reeder 1972
 NODES = 200
@@ -89,3 +89,16 @@ def apparent_zenith(
         seen = np.minimum(true - bending(atmosphere, seen, altitude_m, refractivity), np.pi / 2)
     lowest = bending(atmosphere, np.full(true.shape, np.pi / 2), altitude_m, refractivity)
     return np.where(true - lowest > np.pi / 2, true - lowest, seen)
+
+
+def lift(atmosphere: Any, sun_zenith: Any, altitude_m: Any) -> np.ndarray:
+    """Angles (radians) by which observers at ``altitude_m`` see the sun higher than its true zenith angle
+    ``sun_zenith`` (radians), arrays of one shape: 0 for those above the air. Raises as :func:`bending`."""
+    air = Atmosphere.load(atmosphere)
+    true, height = np.broadcast_arrays(np.asarray(sun_zenith, float), np.asarray(altitude_m, float))
+    found = np.zeros(true.shape)
+    for altitude in np.unique(height[height < air.thickness_m]):
+        here = height == altitude
+        suns, which = np.unique(true[here], return_inverse=True)
+        found[here] = (suns - apparent_zenith(air, suns, float(altitude)))[which]
+    return found

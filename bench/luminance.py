@@ -73,7 +73,8 @@ def compare(atmosphere: Any = "bruneton2008") -> tuple[list[dict[str, Any]], np.
     for i, angle in enumerate(SUNS):
         off = 100.0 * np.log(own[i] / cie[i])
         rms = {f"to_{limit:g}": float(np.sqrt(np.mean(off[view[i] <= limit] ** 2))) for limit in LIMITS}
-        rows.append({"sun_deg": angle, **rms, "mean": float(np.mean(off[view[i] <= LIMITS[0]]))})
+        high = off[view[i] <= LIMITS[0]]
+        rows.append({"sun_deg": angle, **rms, "mean": float(np.mean(high)), "shape": float(np.std(high))})
     return rows, own, cie
 
 
@@ -104,7 +105,8 @@ def main() -> None:
     options = parser.parse_args()
     rows, own, cie = compare()
     heads = {"sun_deg": "sun deg", **{f"to_{v:g}": f"rms log difference %, views to {v:g} deg" for v in LIMITS}}
-    print(table(rows, heads | {"mean": f"mean %, to {LIMITS[0]:g} deg"}))
+    limit = f"to {LIMITS[0]:g} deg"
+    print(table(rows, heads | {"mean": f"mean %, {limit}", "shape": f"rms about the mean %, {limit}"}))
     if options.out:
         with atomic_outputs(check_output(options.out, ".png")) as (part,):
             draw(own, cie, part)

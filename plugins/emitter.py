@@ -101,6 +101,12 @@ Sun and sky of a planet's atmosphere (:monosp:`atmosphere`)
    - |bool|
    - Darken the sun towards its limb (Default: false). The irradiance stays the same.
 
+ * - refraction
+   - |bool|
+   - Show the sun, and light the air, where the atmosphere's own refraction lifts the sun: half a degree at the
+     horizon. ``sun_direction`` or location and time then mean the true place. Rays of view stay straight: the disc is
+     not flattened and the horizon not raised (Default: false).
+
  * - albedo
    - |spectrum|
    - Albedo of the ground, in [0, 1], constant in space (Default: the atmosphere's ``ground_albedo``, 0.1 for
@@ -170,7 +176,7 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         given = props.get_texture("albedo") if "albedo" in props else None
         read = None if given is None else lambda nm: albedo.values(given, nm)
         found = settings.read(props, lambda name: str(mi.file_resolver().resolve(name)), read)
-        self._limb_darkening = found.limb_darkening
+        self._limb_darkening, self._refraction = found.limb_darkening, found.refraction
         ground = found.atmosphere.ground_albedo
         grey = float(ground[0]) if np.ptp(ground) == 0.0 else None
         self._albedo = given if given is not None or grey is None else props.get_texture("albedo", grey)
@@ -245,6 +251,9 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         settings.turning(host(self._to_world.matrix))
         self._update_atmosphere()
         sun = self._local_sun()
+        if self._refraction:
+            altitude = first(self._values["altitude"])
+            sun = mi.Vector3f(*settings.as_seen(self._atmosphere, altitude, sun, host(sun)))
         if dr.is_jit_v(mi.Float):
             dr.make_opaque(sun, self._sun_direction)
         if self._sky is None:

@@ -37,6 +37,8 @@ class AtmosphereNeeds:
         turn = matrix[:3, :3] / np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
         direction = np.array(self.found.direction, dtype=np.float64)
         local = direction if self.found.moment is not None else turn.T @ direction
+        if self.found.refraction:
+            local = np.array(settings.as_seen(self.found.atmosphere, self.found.altitude_m, local, local))
         self.turn, self.sun = turn, turn @ local
         self.sun_zenith_deg = float(np.degrees(np.arctan2(np.hypot(local[0], local[1]), local[2])))
 

@@ -89,8 +89,8 @@ class AtmospherePath:
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
     points, more where it scatters more. Scenes too small for that to matter skip it. With the sun goes the light that
-    has been scattered forward, from about the sun; other light of higher orders is that of the planet without shapes,
-    so the air in a shadow is brighter than it should be (docs/gallery.md says by how much).
+    has been scattered forward, from about the sun; how much of the other light of higher orders is missing is an
+    estimate, by one place for each point at which it may have been scattered before (docs/gallery.md says how good).
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.

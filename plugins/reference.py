@@ -52,8 +52,12 @@ class AtmosphereSun(Sun):
         if found.limb_darkening:
             raise AtmosphereError("complex_sun", "true", "false where the air is path-traced")
         turn = np.array(props["to_world"].matrix, dtype=np.float64)[:3, :3] if "to_world" in props else np.eye(3)
+        turn = turn / np.cbrt(abs(np.linalg.det(turn)))
         direction = np.array(found.direction, dtype=np.float64)
-        self.sun_direction = direction if found.moment is None else turn @ direction
+        local = direction if found.moment is not None else turn.T @ direction
+        if found.refraction:
+            local = np.array(settings.as_seen(found.atmosphere, found.altitude_m, local, local))
+        self.sun_direction = turn @ local
         self.up = turn[:, 2] / np.linalg.norm(turn[:, 2])
         self.found = found
         used, colours, nm = light_of(found.atmosphere, "colour", None)

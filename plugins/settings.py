@@ -17,6 +17,7 @@ import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, InputError, shown
+from atmo_jit.refraction import lift
 from atmo_jit.wavelengths import at_wavelengths, chosen
 
 from .sun_position import Moment, sun_direction
@@ -52,6 +53,7 @@ class Settings:
     sun_scale: float
     sky_scale: float
     limb_darkening: bool
+    refraction: bool
 
 
 def read(props: Any, find_file: Any, albedo: Any = None) -> Settings:
@@ -83,7 +85,22 @@ def read(props: Any, find_file: Any, albedo: Any = None) -> Settings:
         sun_scale=not_negative("sun_scale", number(props, "sun_scale", 1.0)),
         sky_scale=not_negative("sky_scale", number(props, "sky_scale", 1.0)),
         limb_darkening=bool(props.get("complex_sun", False)),
+        refraction=bool(props.get("refraction", False)),
     )
+
+
+def as_seen(atmosphere: Atmosphere, altitude_m: float, local: Any, plain: np.ndarray) -> list[Any]:
+    """Components of the direction to the sun where refraction shows it, given the true one in the local frame:
+    ``local``, numbers or Dr.Jit arrays, and the same as a plain array; the angle between has no derivative."""
+    across = float(np.hypot(plain[0], plain[1]))
+    angle = float(lift(atmosphere, np.arctan2(across, plain[2]), altitude_m)) if across > 0.0 else 0.0
+    if angle == 0.0:
+        return list(local)
+    x, y, z = local
+    across = (x * x + y * y) ** 0.5
+    sin, cos = float(np.sin(angle)), float(np.cos(angle))
+    horizontal = cos - z / across * sin
+    return [x * horizontal, y * horizontal, z * cos + across * sin]
 
 
 def with_albedo(atmosphere: Atmosphere, values: np.ndarray) -> Atmosphere:

@@ -51,3 +51,10 @@ def test_the_twilight_zenith_is_blue_by_ozone() -> None:
     assert np.all(dusk < dusk_without - 0.03)  # x and y: bluer
     assert np.abs(day - day_without).max() < 0.01
     assert dusk_without[0] > day_without[0] + 0.02
+
+
+def test_a_type_of_aerosol_is_what_opac_computes() -> None:
+    """OPAC 3.1's own output for continental polluted air at 80 % humidity and 550 nm (IPSL, ether, iasi/aerosol)."""
+    kind = AEROSOLS["continental_polluted"]
+    found = (kind.extinction_per_m, kind.single_scattering_albedo, kind.asymmetry, kind.optical_depth)
+    np.testing.assert_allclose(found, (1.746e-4, 0.8925, 0.6977, 0.3270), rtol=3e-3)

@@ -27,6 +27,7 @@ from atmo_jit.views import load_views
 @click.option("--gradient", metavar="NAME,...", default="", help="Parameters by which to differentiate the radiance.")
 @click.option("--no-ground", is_flag=True, help="Leave out the ground's own radiance.")
 @click.option("--sun-disc", is_flag=True, help="Add the sun's disc to views that meet it.")
+@click.option("--refraction", is_flag=True, help="Views have the sun's true place; the air lifts it.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 def command(
     atmosphere: str,
@@ -38,6 +39,7 @@ def command(
     gradient: str,
     no_ground: bool,
     sun_disc: bool,
+    refraction: bool,
     quiet: bool,
 ) -> None:
     """Sky radiance for every view in an NPZ file.
@@ -55,6 +57,11 @@ def command(
     path = check_output(out, ".npz")
     air = Atmosphere.load(atmosphere)
     rays = load_views(views)
+    if refraction:
+        from atmo_jit.refraction import lift
+
+        zenith = np.radians(rays["sun_zenith_deg"])
+        rays["sun_zenith_deg"] = np.degrees(zenith - lift(air, zenith, rays["altitude_m"]))
 
     from atmo_jit.sky import sky  # after the input is known to be good: this imports Dr.Jit
 

@@ -215,3 +215,21 @@ def test_fast_wavelengths_have_the_colours_of_forty(rgb, elevation):
         worst[len(given)] = difference(found @ np.linalg.inv(xyz_to_srgb()).T, true_xyz(light)).max()
     assert worst[1] < 1.5
     assert elevation > 30.0 or worst[0] > 3.0  # and the preset's own three are not enough at twilight
+
+
+def test_refraction_lifts_the_sun(rgb):
+    """The sun is half a degree higher at the horizon, also where the air is path-traced; derivatives pass through."""
+    from atmo_jit.refraction import apparent_zenith
+
+    true = math.radians(90.3)
+    direction = [math.sin(true), 0.0, math.cos(true)]
+    lifted = mi.load_dict({"type": "atmosphere", "sun_direction": direction, "refraction": True})
+    straight = mi.load_dict({"type": "atmosphere", "sun_direction": direction})
+    seen_at = float(apparent_zenith("earth", true, 1.0))
+    assert math.degrees(true - seen_at) > 0.4
+    np.testing.assert_allclose(lifted.sun, [math.sin(seen_at), 0.0, math.cos(seen_at)], atol=1e-6)
+    np.testing.assert_allclose(straight.sun, direction, atol=1e-6)
+    there = np.array([[math.sin(seen_at), 0.0, math.cos(seen_at)]])
+    assert seen(lifted, there)[0, 0] > 100.0 * seen(straight, there)[0, 0]
+    twin = mi.load_dict({"type": "atmosphere_sun", "sun_direction": direction, "refraction": True})
+    np.testing.assert_allclose(twin.sun_direction, lifted.sun, atol=1e-6)

@@ -128,6 +128,58 @@ def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
     assert np.median(np.sqrt(estimates[1].variance) / estimates[1].mean) < 0.01
 
 
+def test_instances_are_the_shapes_that_they_stand_for(plugins):
+    """Two towers of a group, in place of two cubes: the same shafts and surfaces."""
+    mi.set_variant("llvm_ad_mono")
+    at = mi.ScalarTransform4f()
+    places = [
+        at.translate([-1200, 6000, 1300]).scale([900, 400, 1500]),
+        at.translate([2000, 5000, 1000]).scale([900, 400, 1200]),
+    ]
+    sky = {"type": "atmosphere", "atmosphere": json.dumps(HAZE), "sun_direction": SUN.tolist(), "sun_scale": 0.0}
+    common = {
+        "type": "scene",
+        "integrator": {"type": "atmosphere_path", "max_depth": 2},
+        "sky": {**sky, "altitude": 0.0},
+        "sensor": camera(24, 16, [0, 0, 100], [0, 1000, 260], far_clip=1e8),
+    }
+    cubes = {f"cube{i}": {"type": "cube", "to_world": place} for i, place in enumerate(places)}
+    group = {"type": "shapegroup", "cube": {"type": "cube"}}
+    instances = {
+        f"instance{i}": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place}
+        for i, place in enumerate(places)
+    }
+    scenes = [mi.load_dict({**common, **cubes}), mi.load_dict({**common, "group": group, **instances})]
+    assert_agree(*(of_passes(tiles(passes(scene, 6, 8), 8)) for scene in scenes))
+
+
+def test_textures_and_height_fields(rgb):
+    """They look as in a scene without air. The field is one of distances, Mitsuba's own kind of a landscape."""
+    at = mi.ScalarTransform4f()
+    checks = {"type": "checkerboard", "to_uv": at.scale([4, 4, 1])}
+    floor = {"type": "rectangle", "to_world": at.scale(20), "bsdf": {"type": "diffuse", "reflectance": checks}}
+    z, y, x = np.meshgrid(*[np.linspace(0.0, 1.0, 9)] * 3, indexing="ij")
+    above = z - 0.5 - 0.25 * np.sin(6.0 * x) * np.sin(6.0 * y)
+    grid = mi.TensorXf(0.5 * above[..., None].astype(np.float32))
+    field = {"type": "sdfgrid", "grid": grid, "to_world": at.translate([-4, -4, 0]).scale([8, 8, 4])}
+    found = []
+    for integrator in ("path", "atmosphere_path"):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": integrator, "max_depth": 3},
+                "sky": {"type": "atmosphere", "sun_direction": [0.3, -0.7, 0.4], "altitude": 2.0},
+                "sensor": camera(16, 8, [0, -12, 8], [0, 0, 0]),
+                "floor": floor,
+                "field": field,
+            }
+        )
+        found.append(of_passes(tiles(passes(scene, 8, 32), 4)))
+    for estimate in found:
+        estimate.variance[:] += (0.003 * found[0].mean) ** 2
+    assert_agree(*found)
+
+
 @pytest.mark.parametrize("altitude", [2.0, 50e3, 400e3])
 def test_without_shapes_the_picture_is_the_sky(rgb, altitude):
     size, parts = 16, 8
