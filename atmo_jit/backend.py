@@ -6,9 +6,10 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, wraps
 from types import ModuleType
 from typing import Any
 
@@ -106,6 +107,21 @@ def packet(buffer: Any, index: Any, count: int, active: Any = True, *, alone: bo
         return [dr.gather(one, buffer, index, active, mode=mode)]
     values = dr.gather(several, buffer, index, active, mode=mode, shape=(count, dr.width(index)))
     return [values[i] for i in range(count)]
+
+
+_alone = threading.RLock()
+
+
+def one_at_a_time(work: Callable[..., Any]) -> Callable[..., Any]:
+    """``work`` for one thread at a time: what is kept with a grid, recordings above all, is everyone's, and Dr.Jit
+    does not record or play back one in two threads at once."""
+
+    @wraps(work)
+    def alone(*arguments: Any, **options: Any) -> Any:
+        with _alone:
+            return work(*arguments, **options)
+
+    return alone
 
 
 def not_negative(value: Any) -> Any:

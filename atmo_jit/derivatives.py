@@ -18,7 +18,7 @@ import numpy as np
 
 from ._trees import flat, like
 from .atmosphere import Atmosphere
-from .backend import doubles, floats
+from .backend import doubles, floats, one_at_a_time
 from .errors import InputError
 from .evaluation import OUTPUTS, Evaluation, TableEvaluation, where
 from .grid import Grid
@@ -97,6 +97,7 @@ class Linearization:
         evaluation, arguments = self._evaluating(by_views=False)
         return self._arrays(evaluation(self._made, *arguments))
 
+    @one_at_a_time
     def jacobian(self, names: Sequence[str], output: str = "radiance") -> dict[str, np.ndarray]:
         """Derivatives of one output by name: [N, W]; [N, W, n] for the n nodes of a profile.
 
@@ -119,6 +120,7 @@ class Linearization:
             name: np.stack(parts, axis=-1) if ".profile." in name else parts[0] for name, parts in columns.items()
         }
 
+    @one_at_a_time
     def jvp(self, changes: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Changes of all outputs, [N, W] by name, along changes of parameters (each of the shape of its parameter, or
         one number for all of it). Raises InputError for an unknown name."""
@@ -131,6 +133,7 @@ class Linearization:
             total = {o: total[o] + v for o, v in self._along(seeds).items()}
         return total
 
+    @one_at_a_time
     def vjp(self, cotangents: Mapping[str, Any], names: Sequence[str]) -> dict[str, np.ndarray]:
         """Derivatives of sum(cotangents[output] * output) over the named outputs, by name, in reverse: one pass for
         all, each of the shape of its parameter.

@@ -20,7 +20,7 @@ import numpy as np
 
 from . import __version__
 from .atmosphere import Atmosphere
-from .backend import doubles, floats, types, uints
+from .backend import doubles, floats, one_at_a_time, types, uints
 from .bundle import Bundle
 from .column import SunColumns, sun_columns
 from .errors import InputError
@@ -79,6 +79,7 @@ class Sky:
     orders are solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
     """
 
+    @one_at_a_time
     def __init__(
         self,
         atmosphere: Any,
@@ -148,6 +149,7 @@ class Sky:
         """All numbers of the solution, per band: Floats by name."""
         return [{"columns": band.columns.table, **band.field.held} for band in self._bands]
 
+    @one_at_a_time
     def rays(
         self,
         altitude_m: Any,
@@ -201,6 +203,7 @@ class Sky:
                     radiance[c] = dr.fma(disc * solar, transmittance[c], radiance[c])
         return RayLight(radiance, transmittance)
 
+    @one_at_a_time
     def table(
         self, altitude_m: Any, view_zenith: Any, sun_zenith: Any, azimuth: Any, *, ground: bool = True
     ) -> RayLight:
@@ -236,6 +239,7 @@ class Sky:
             last[key] = Bundle(grid, h, mu)
         return last[key]
 
+    @one_at_a_time
     def irradiance(self, altitude_m: Any, sun_zenith: Any) -> tuple[list[Any], list[Any]]:
         """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``:
         lists of W Floats."""
@@ -319,6 +323,7 @@ class SkyResult:
     gradient: dict[str, np.ndarray] = field(default_factory=dict)
 
 
+@one_at_a_time
 def sky(
     atmosphere: Any,
     views: Mapping[str, Any],

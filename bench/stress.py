@@ -2,7 +2,7 @@
 
     python -m bench.stress                                # 100,000 pairs of atmosphere and view, 2,000 derivatives
     python -m bench.stress --pairs 5000 --derivatives 0 --first 40      # from the 40th atmosphere on
-    python -m bench.stress --markdown docs/limits.md
+    python -m bench.stress --per-world 2000 --markdown docs/limits.md
 
 Every atmosphere has a number, from which it and its views follow (bench.extremes): a line of the result names the one
 where a quantity is worst, and ``--first`` returns to it. Exit status 1 where a value is not finite or negative.
@@ -252,12 +252,12 @@ def sweep(
 def sweep_derivatives(
     checks: int, first: int = 0, tally: Tally | None = None, advance: Callable[[float], None] | None = None
 ) -> Tally:
-    """``checks`` derivatives of a view by a parameter, 25 views and 4 parameters an atmosphere."""
-    tally, count = tally or Tally(), -(-checks // 100)
+    """``checks`` derivatives of a view by a parameter, 50 views and 4 parameters an atmosphere."""
+    tally, count = tally or Tally(), -(-checks // 200)
     for i, number in enumerate(range(first, first + count)):
         rng = Random(number)
         world = extreme_world(rng, widths=(1, 1, 3))
-        tally.add(number, check_derivatives(rng, world, extreme_views(rng, world, 25), 4))
+        tally.add(number, check_derivatives(rng, world, extreme_views(rng, world, 50), 4))
         if advance:
             advance((i + 1) / count)
     return tally
@@ -277,12 +277,13 @@ def main() -> int:
     parser.add_argument("--pairs", type=int, default=100_000, help="of atmosphere and view (default: %(default)s)")
     parser.add_argument("--derivatives", type=int, default=2_000, help="by a parameter (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first atmosphere (default: %(default)s)")
+    parser.add_argument("--per-world", type=int, default=PER_WORLD, help="views of each (default: %(default)s)")
     parser.add_argument("--markdown", type=Path, help="page whose table is replaced by this one")
     options = parser.parse_args()
     start = time.perf_counter()
     page = check_output(options.markdown, ".md") if options.markdown else None
     with progress_bar("pairs") as advance:
-        tally = sweep(options.pairs, options.first, advance=advance)
+        tally = sweep(options.pairs, options.first, options.per_world, advance)
     with progress_bar("derivatives") as advance:
         sweep_derivatives(options.derivatives, options.first, tally, advance)
     print(table(tally))

@@ -49,6 +49,7 @@ class Server(ThreadingHTTPServer):
     one thread that solves, as everything is that touches Dr.Jit. Raises InputError where nothing can listen there."""
 
     daemon_threads = True
+    request_queue_size = 128  # a page asks for many things at once; those beyond five were turned away
 
     def __init__(self, make: Callable[[], Any], port: int = 0) -> None:
         self._solver = ThreadPoolExecutor(max_workers=1)

@@ -1,0 +1,63 @@
+"""Damaged and malicious files: status 2 and one line, in bounded memory, and nothing else touched."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import zipfile
+from random import Random
+
+import numpy as np
+import pytest
+
+from bench.hostile import _hostile_npz, _npz, damaged, feed, targets
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (3 << 30,) * 2)
+from atmo_jit.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_some_of_the_files():
+    found, wrong = feed(21, seed=1)
+    assert wrong == [] and sum(found.values()) == 21
+
+
+@pytest.mark.slow
+def test_many_of_the_files():
+    assert feed(500, seed=2)[1] == []
+
+
+def test_a_good_file_is_damaged(tmp_path):
+    """The fuzzer does what it says: few of its files are still good."""
+    for target in targets(tmp_path):
+        bad = {damaged(Random(i), target, tmp_path / "mark") for i in range(30)}
+        assert len(bad - {target.content}) > 15
+
+
+def test_a_bomb_takes_no_memory(tmp_path):
+    """A packed array of 4 GiB, of which half a GiB is there, and another bad file, in a process that may have 3 GiB."""
+    good = _npz({name: np.zeros(6) for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")})
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("altitude_m.npy", "w", force_zip64=True) as member:
+            np.lib.format.write_array_header_1_0(
+                member, {"descr": "<f8", "fortran_order": False, "shape": (1 << 29,)}
+            )
+            for _ in range(1 << 5):
+                member.write(b"\0" * (1 << 24))
+    for i, content in enumerate([stream.getvalue(), _hostile_npz(Random(0), good, tmp_path / "mark")]):
+        (tmp_path / f"{i}.npz").write_bytes(content)
+        done = subprocess.run(
+            [sys.executable, "-c", LIMITED, "sky", "--atmosphere", "earth", "--views", f"{i}.npz", "--out", "o.npz"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert done.returncode in (0, 2), done.stderr
+        assert i or (done.returncode == 2 and done.stderr.count("\n") == 1)
+    assert not (tmp_path / "mark").exists()
