@@ -167,6 +167,11 @@ class Field:
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel]
         (march.Source)."""
+        values = self.unclipped(h, mu_s, mu, cos_phi, active)
+        return [[dr.maximum(value, 0.0) for value in of_kind] for of_kind in values]
+
+    def unclipped(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
+        """The same, below 0 where few moments cannot tell it from 0: a sum, whose derivatives do not ask what it is."""
         t = types()
         channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
         nodes, weights, scales = self.corners(h, mu_s, active)
@@ -181,7 +186,7 @@ class Field:
             corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
             moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
             degree = t.UInt(dr.gather(t.Float, degrees, i, active))
-            chi = row(phases, degree, kinds * channels, active=active)
+            chi = row(phases, degree, kinds * channels, active=active, alone=True)
             light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
             return i + 1, state, [
                 [dr.fma(value, part, s) for part, s in zip(light, old, strict=True)]
@@ -198,7 +203,7 @@ class Field:
             steps = mu - basis.mu, sine * cos_phi - basis.x
             for step, slopes in zip(steps, sums[1:], strict=True):
                 total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
-        return [[dr.maximum(total[n * channels + c], 0.0) for c in range(channels)] for n in range(kinds)]
+        return [total[n * channels : (n + 1) * channels] for n in range(kinds)]
 
 
 class _Harmonics:

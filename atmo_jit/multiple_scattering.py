@@ -26,7 +26,7 @@ from .recording import Recordings
 from .refinement import Reference
 from .resolution import Resolution
 from .single_scattering import first_order
-from .total import total_of
+from .total import following, total_of
 
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
@@ -75,7 +75,9 @@ def solve_again(
     optics = optics.with_values(values)
     steps = _Steps(optics, columns, grid, resolution)
     done = steps.started(values, len(shares) + 1)
-    parts = steps.finished(values, done["reference"], done["first"], done["later"], shares)
+    parts = steps.finished(
+        values, done["reference"], done["first"], done["later"], shares, extrapolated=orders is None
+    )
     return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
 
 
@@ -227,7 +229,14 @@ class _Steps:
         return project(gather(light), self._grid.shape[1], light.channels)
 
     def finished(
-        self, values: Any, reference: Any, first: Any, later: list[Any], shares: list[Any]
+        self,
+        values: Any,
+        reference: Any,
+        first: Any,
+        later: list[Any],
+        shares: list[Any],
+        *,
+        extrapolated: bool = False,
     ) -> tuple[Any, ...]:
         """The same, traced."""
         optics, grid = self._optics.with_values(values), self._grid
@@ -235,6 +244,8 @@ class _Steps:
         reference = Reference.of(grid, channels, reference)
         first = Moments(first, *self._degree(1), len(grid.first_theta), channels)
         rest = [Moments(v, *self._degree(n), grid.shape[1], channels) for n, v in enumerate(later, 2)]
+        if extrapolated:
+            shares = following(grid, reference, rest, shares)
         return total_of(optics, self._columns, grid, reference, first, rest, shares)
 
 

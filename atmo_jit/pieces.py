@@ -14,6 +14,7 @@ import drjit as dr
 
 from .backend import evaluated, row, sum_loop, table_of, types
 from .column import SunColumns
+from .field import Field
 from .geometry import altitude_along
 from .march import (
     NODES,
@@ -21,7 +22,6 @@ from .march import (
     Light,
     Rays,
     Rule,
-    Source,
     point_along,
     relative_azimuth,
     unfinished,
@@ -112,7 +112,7 @@ def light_along(
     rays: Rays,
     pieces: Pieces | None,
     *,
-    source: Source | None = None,
+    source: Field | None = None,
 ) -> Light:
     """What march.march returns, differentiable with respect to everything that enters."""
     t, channels, kinds = types(), optics.channel_count, len(optics.constituents)
@@ -170,7 +170,7 @@ def light_along(
         toward = _asked(optics, source, here, at, length, total > 0.0)
         for n in range(len(scatterers)):
             for c in range(channels):
-                more[c] = dr.fma(weight[n * channels + c], toward[n * channels + c], more[c])
+                more[c] = dr.fma(weight[n * channels + c], dr.maximum(toward[n * channels + c], 0.0), more[c])
     ray = dr.arange(t.UInt, width)
     bounds = [dr.gather(t.UInt, pieces.first, ray + i) for i in (0, 1)]
     sums = _sums(table_of([*one, *more], lane), *bounds, 2 * channels)
@@ -182,7 +182,7 @@ def light_along(
     )
 
 
-def _asked(optics: Optics, source: Source, rays: Rays, at: Any, length: Any, active: Any) -> list[Any]:
+def _asked(optics: Optics, source: Field, rays: Rays, at: Any, length: Any, active: Any) -> list[Any]:
     """The source at a distance along each ray: [scatterer x channel].
 
     Where only the distance carries derivatives, as the centroid of a piece does, they are differences of the source a
@@ -192,7 +192,7 @@ def _asked(optics: Optics, source: Source, rays: Rays, at: Any, length: Any, act
     def toward(distance: Any) -> list[Any]:
         altitude, r, sun = point_along(optics, rays, distance)
         mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -1.0, 1.0)
-        values = source.scattered(altitude, sun, mu, relative_azimuth(mu, sun, rays.nu), active)
+        values = source.unclipped(altitude, sun, mu, relative_azimuth(mu, sun, rays.nu), active)
         return [value for of_kind in values for value in of_kind]
 
     if not dr.grad_enabled(at) or dr.grad_enabled(rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop):

@@ -18,6 +18,7 @@ from .refinement import Reference, Taps
 # Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
 # derivative of a quotient, which has a square below the line, must not leave single precision.
 DARK = 1e-16
+FEW_LEFT = 0.01  # of order 1, and their ratio is steady
 
 
 def total_of(
@@ -56,6 +57,45 @@ def total_of(
     dr.scatter(sky, total, node * channels + channel, entry == entries + 1)
     moments, reflected, sky = evaluated([moments, reflected, sky])
     return moments, _over(grid, sky, per_depth, channels), _over(grid, reflected, per_depth, channels)
+
+
+def following(
+    grid: Grid, reference: Reference, rest: list[Moments], shares: list[tuple[Any, Any]]
+) -> list[tuple[Any, Any]]:
+    """Shares of the orders that carry derivatives, for those of an extrapolation, which carry none.
+
+    Where few orders are left the last stands for all that follow it, which are geometric by then: it counts as
+    1 / (1 - rho), with rho the ratio of the last two orders, least squares over altitudes, and all others as 1.
+    """
+    if len(rest) < 2:
+        return shares
+    t, channels, suns = types(), rest[-1].channels, grid.shape[1]
+    lane = dr.arange(t.UInt, suns * channels)
+    channel, sun = lane % channels, lane // channels
+
+    def add(i: Any, product: Any, square: Any) -> tuple[Any, ...]:
+        k, entry = i // 2, i % 2
+        scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+        before, last = (
+            scale * dr.gather(t.Float, light.values, light.index(k, entry, sun, channel)) for light in rest[-2:]
+        )
+        return i + 1, dr.fma(before, last, product), dr.fma(before, before, square)
+
+    zeros = [dr.zeros(t.Float, suns * channels) for _ in range(2)]
+    end = dr.opaque(t.UInt, 2 * grid.shape[0], 1)
+    _, product, square = dr.while_loop(
+        (t.UInt(0), *zeros), lambda i, *_: i < end, add, max_iterations=-1, label="following"
+    )
+    product, square = evaluated([product, square])
+    lit = square > DARK
+    ratio = dr.maximum(dr.select(lit, product / dr.select(lit, square, 1.0), 0.0), 0.0)
+    left = 1.0
+    for _ in rest:
+        left = left * dr.detach(ratio)
+    geometric = left < FEW_LEFT
+    last = 1.0 / (1.0 - dr.select(geometric, ratio, 0.0))
+    counts = evaluated([dr.select(geometric, last, share) for share in shares[-1]])
+    return [*([dr.select(geometric, 1.0, share) for share in both] for both in shares[:-1]), counts]
 
 
 def _rest(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 import pytest
-from tolerances import ADJOINT, DERIVATIVE_BY_COEFFICIENT, DERIVATIVE_BY_G, DIFFERENCES, NODES_MOVED
+from tolerances import ADJOINT, DERIVATIVE_BY_COEFFICIENT, DERIVATIVE_BY_G, DIFFERENCES, NODES_MOVED, VIEW_MOVED
 
 import atmo_jit
 from atmo_jit.backend import types
@@ -56,9 +56,9 @@ def differences(at, name, step):
     [
         ("mie.scattering_per_m", 0.02),
         ("rayleigh.scattering_per_m", 0.02),
-        ("mie.single_scattering_albedo", 0.02),
-        ("mie.phase.g", 0.01),
-        ("ozone.absorption_per_m", 0.2),
+        ("mie.single_scattering_albedo", 0.01),
+        ("mie.phase.g", 0.005),
+        ("ozone.absorption_per_m", 0.1),
         ("ground_albedo", 0.1),
         ("solar_irradiance", 0.1),
         ("azimuth_deg", 0.05),
@@ -70,7 +70,8 @@ def test_derivatives_are_those_of_differences(at, name, step):
     exact = at.jacobian([name])[name] * (1.0 if name in VIEWS else described(at.atmosphere, name))
     want = differences(at, name, step)
     scale = np.abs(want).max(axis=0)
-    assert np.abs(exact - want).max() < DIFFERENCES * scale.max()
+    allowed = VIEW_MOVED if name in VIEWS else DIFFERENCES
+    assert np.abs(exact - want).max() < allowed * scale.max()
     assert np.abs(exact / scale).max() > 0.9
 
 
