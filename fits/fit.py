@@ -95,7 +95,8 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     # Poor ends are compared by their residuals, whose scale does not change with the loss.
     best = min(tries, key=lambda end: _scale(end.left))
     end = _polished(whole, whole.spread(few, best.solution.u), report)
-    if whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
+    # Where the model errs more than the data, finer nodes show nothing.
+    if end.problem.excess == 1.0 and whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
         end = _polished(whole, end.solution.u, report)
     problem, u, solution = end.problem, end.solution.u, end.solution
     found = replace(problem.evaluate(u), jacobian=solution.jacobian)

@@ -23,6 +23,7 @@ FAILURES = 6  # steps, each shorter than the one before, that may raise the cost
 TRUSTED = 2  # corrections of a Jacobian that is still believed where it says that nothing is left to gain
 FORESEEN = 0.5  # part of a step's change that the Jacobian may have missed to be corrected and not computed
 FARTHEST = 30.0  # u between which L-BFGS-B looks
+UNKNOWN = 1e-14  # of the largest curvature, below which there is none
 DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
@@ -110,19 +111,18 @@ class Residuals:
 
     def small(self, u: Any, more: float) -> tuple[np.ndarray, np.ndarray]:
         """P + 1 residuals and their Jacobian [P + 1, P] whose least squares have the cost of all, and ``more``, its
-        gradient and, by the curvature of the loss, its Hessian: by the QR decomposition of both side by side.
+        gradient g and, by the curvature of the loss, its Hessian H = V diag(w) V': sqrt(w) V', with w^-1/2 V' g.
 
         ``more`` has to be at least the cost: slope^2 / curvature is up to four times a robust loss.
         """
-        _, slope, curvature = self._loss(self.residual(u))
-        root = np.sqrt(curvature)
-        size = len(u)
-        triangle = np.zeros((size, size + 1))
-        found = np.linalg.qr(np.column_stack([root[:, None] * self.jacobian(u), slope / root]), mode="r")[:size]
-        triangle[: len(found)] = found
-        jacobian, residual = triangle[:, :size], triangle[:, size]
-        rest = np.sqrt(max(2.0 * (self.cost(u) + more) - float(residual @ residual), 0.0))
-        return np.append(residual, rest), np.vstack([jacobian, np.zeros(size)])
+        jacobian = self.jacobian(u)
+        loss, slope, curvature = self._loss(self.residual(u))
+        w, v = np.linalg.eigh(jacobian.T @ (curvature[:, None] * jacobian))
+        known = w > UNKNOWN * max(w[-1], 0.0)
+        root = np.sqrt(np.where(known, w, 1.0))
+        residual = np.where(known, v.T @ (jacobian.T @ slope) / root, 0.0)
+        rest = np.sqrt(max(2.0 * (float(np.sum(loss)) + more) - float(residual @ residual), 0.0))
+        return np.append(residual, rest), np.vstack([np.where(known, root, 0.0)[:, None] * v.T, np.zeros(len(w))])
 
 
 def _jaxopt() -> tuple[Any, Any]:
