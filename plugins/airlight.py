@@ -63,7 +63,7 @@ class Airlight:
             dr.eval(shells.densest)
         # These say where shadows are looked for.
         self._guide, self._guide_beam = self.bands[0].optics, self._beams[0]
-        self._cosine = mean_cosine(self.bands[0])
+        self._asymmetry = asymmetry(self.bands[0])
         self.count = len(sky.atmosphere.wavelengths_nm)
         ground = [band.optics.largest_extinction(band.optics.densities(mi.Float(0.0))) for band in self.bands]
         self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
@@ -167,8 +167,8 @@ class Airlight:
         extinction at the start), by the first of the four random numbers ``samples``. ``lit`` says whether the sun is
         seen (1 or 0) from a distance along the ray. That keeps away order 1, and of higher orders what comes from so
         near the sun that the same shapes are in its way (:func:`beam_extinction`). ``around`` says how much of the rest
-        is missing there, given three more random numbers, light's mean free path (scene units), the mean cosine of its
-        scatterings, and how bright sunlit surfaces are beside the air."""
+        is missing there, given three more random numbers, light's mean free path (scene units), the asymmetry of its
+        scattering, and how bright sunlit surfaces are beside the air."""
         rays, scale = part.rays, self.globe.scale
         optics = self.bands[0].optics
         first = dr.clip(start * (1.0 / scale) - part.gap, 0.0, rays.stop)
@@ -199,7 +199,7 @@ class Airlight:
             shining = visible_sun(optics, h, r, mu_s)
             path = self._mean_path(self._guide.densities(h)) * scale
             others = [u - dr.floor(u) for u in others]
-            less = 0.0 if later is None else around(place, others, path, self._cosine, surfaces)
+            less = 0.0 if later is None else around(place, others, path, self._asymmetry, surfaces)
             new = []
             for b, (band, beam, values) in enumerate(zip(self.bands, self._beams, phases, strict=True)):
                 o = band.optics
@@ -281,13 +281,14 @@ def beam_extinction(band: Any, *, scaled: bool) -> list[Any]:
     return found
 
 
-def mean_cosine(band: Any) -> Any:
-    """Mean cosine of the scatterings that :func:`beam_extinction` counts, at the ground."""
-    optics, (turned, forward) = band.optics, (0.0, 0.0)
+def asymmetry(band: Any) -> Any:
+    """Of the phase function of Henyey and Greenstein whose second moment, g^2, is that of all scattering at the
+    ground."""
+    optics, whole, second = band.optics, 0.0, 0.0
     density = optics.densities(mi.Float(0.0))
     for k in optics.scatterers:
         phase = optics.constituents[k].phase
         for c, i in enumerate(optics.indices):
             amount = float(np.array(optics.scattering[k][c] * density[k]).ravel()[0])
-            turned, forward = turned + amount, forward + amount * float(moments_of(phase.at(int(i)), 1)[1])
-    return number(forward / turned if turned > 0.0 else 0.0)
+            whole, second = whole + amount, second + amount * float(moments_of(phase.at(int(i)), 2)[2])
+    return number(max(second / whole, 0.0) ** 0.5 if whole > 0.0 else 0.0)

@@ -353,7 +353,7 @@ class AtmospherePath:
         active: Any,
         samples: list[Any],
         path: Any,
-        cosine: Any,
+        asymmetry: Any,
         surfaces: Any,
     ) -> Any:
         """How much of the light that is scattered along a ray, back to its origin, is missing because of shapes: 0 or
@@ -361,7 +361,7 @@ class AtmospherePath:
         if that is on a surface, ``surfaces`` is what sunlight makes of it, there as in the scene without shapes."""
         by_sun = samples[0] < 0.5
         u = mi.Point2f(dr.select(by_sun, 2.0 * samples[0], 2.0 * samples[0] - 1.0), samples[1])
-        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(henyey_greenstein(u, cosine))
+        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(henyey_greenstein(u, asymmetry))
         there = mi.Ray3f(ray.o, w)
         there.maxt = -path * dr.log(1.0 - samples[2])
         hit = scene.ray_intersect_preliminary(there, active=active)
@@ -370,9 +370,9 @@ class AtmospherePath:
         lost = 1.0 - self._lit(scene, end, toward, active) * dr.select(covers, surfaces, 1.0)
         # More light comes from about the sun. The convolution of two such phase functions, by which the weight has
         # the mean 1, is another, whose asymmetry is the product of theirs.
-        ahead, sunward = (phase_times_4pi(cosine, dr.dot(w, axis)) for axis in (ray.d, toward))
+        ahead, sunward = (phase_times_4pi(asymmetry, dr.dot(w, axis)) for axis in (ray.d, toward))
         weight = 2.0 * ahead * sunward / (ahead + sunward)
-        return lost * weight / phase_times_4pi(cosine * cosine, dr.dot(ray.d, toward))
+        return lost * weight / phase_times_4pi(asymmetry * asymmetry, dr.dot(ray.d, toward))
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
