@@ -45,3 +45,12 @@ def test_names_of_the_glossary_are_used():
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
     assert all((page.parent / link).is_file() for link in links)
+
+
+def test_the_page_of_plugins_is_that_of_their_docstrings():
+    from atmo_jit.plugins import PLUGINS
+    from bench.plugin_page import PAGE, PAGES, page
+
+    assert PAGE.read_text(encoding="utf-8") == page(), "python -m bench.plugin_page writes it"
+    internal = {"AtmosphereNeeds", "AtmosphereSun"}
+    assert {name for name, _ in PAGES} | internal == {entry[3] for entry in PLUGINS.values()}
