@@ -122,13 +122,23 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
 
 class Shells:
     """What a march looks up: the altitudes (m) at which it cuts, the largest extinction (1/m) of every channel between
-    two of them (a table [shell, channel]), and quadrature rules."""
+    two of them (a table [shell, channel], or [shell, 1]: of all), and quadrature rules.
 
-    def __init__(self, optics: Optics) -> None:
+    ``largest``: that of all channels, where it is known.
+    """
+
+    def __init__(self, optics: Optics, largest: Any = None) -> None:
         self.breaks = floats(optics.breaks_m)
         self.last = parameter(len(optics.breaks_m) - 2.0)
-        self.densest = _largest_extinctions(optics, self.breaks)
+        self._densest = _largest_extinctions(optics, self.breaks) if largest is None else floats(largest)
+        self._each = largest is None
         self._rules: dict[int, Rule] = {}
+
+    def densest(self, shell: Any, channels: int) -> list[Any]:
+        """The largest extinction of every channel in a shell."""
+        if self._each:
+            return row(self._densest, shell, channels)
+        return [dr.gather(types().Float, self._densest, shell)] * channels
 
     def rule(self, nodes: int) -> Rule:
         """The rule of so many nodes."""
@@ -172,7 +182,7 @@ class Cuts:
     def __init__(self, optics: Optics, rays: Rays, *, sunlit: bool = True, shells: Shells | None = None) -> None:
         self._optics, self._rays = optics, rays
         shells = shells or Shells(optics)
-        self._breaks, self._last, self._densest = shells.breaks, shells.last, shells.densest
+        self._breaks, self._last, self._shells = shells.breaks, shells.last, shells
         self._perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
         self._r_mu = (optics.radius + rays.h) * rays.mu
         self._edges = _sunlight_edges(optics, rays) if sunlit else []
@@ -201,7 +211,7 @@ class Cuts:
         depths = self._optics.optical_depths(amounts)
         rate = t.Float(1e-30)
         # Fog in one channel is no reason for small steps in the others once it hides everything.
-        for depth, densest in zip(depths, row(self._densest, t.UInt(shell), len(depths)), strict=True):
+        for depth, densest in zip(depths, self._shells.densest(t.UInt(shell), len(depths)), strict=True):
             rate = dr.select(depth < SPENT_DEPTH, dr.maximum(rate, densest), rate)
         longest = MAX_DEPTH / rate
         limit = d + dr.minimum(longest, self._farthest)

@@ -110,9 +110,8 @@ def _light_of(sky: Sky) -> Any:
 
 def _shells(sky: Sky) -> Shells:
     """Those of the most opaque atmosphere on the nodes."""
-    shells = Shells(sky.solutions[0].optics)
-    breaks = np.array(sky.solutions[0].optics.breaks_m)
-    at, under = (sky.grid.extinction_bound(h) for h in (breaks, breaks * (1.0 - 1e-6)))
-    shells.densest = floats(np.maximum(at[:-1], under[1:]))
+    optics = sky.solutions[0].optics
+    at, under = (sky.grid.extinction_bound(optics.breaks_m * share) for share in (1.0, 1.0 - 1e-6))
+    shells = Shells(optics, np.maximum(at[:-1], under[1:]))
     shells.rule(NODES)
     return shells

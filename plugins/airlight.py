@@ -60,7 +60,6 @@ class Airlight:
         self._shells = [Shells(band.optics) for band in self.bands]
         for shells in self._shells:
             shells.rule(NODES)
-            dr.eval(shells.densest)
         # These say where shadows are looked for.
         self._guide, self._guide_beam = self.bands[0].optics, self._beams[0]
         self._asymmetry = asymmetry(self.bands[0])
