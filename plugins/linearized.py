@@ -16,11 +16,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from atmo_jit._trees import flat, like
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.derivatives import PROFILE
 from atmo_jit.errors import InputError
 from atmo_jit.optics import on_device
-from atmo_jit.parameters import RADII, check_names, described, flat, like, tangent
+from atmo_jit.parameters import RADII, check_names, described, tangent
 from atmo_jit.sky import Sky
 
 Changes = Mapping[str, np.ndarray]
