@@ -24,17 +24,17 @@ VIEWS_AT_ONCE = 1 << 18  # of atmo_jit.sky: bounds memory
 
 # --- printed by `python -m bench.constants` ---
 # CPU seconds per unit of each loop's size (see `loop_sizes`), kernels warm.
-SECONDS = {"fixed": 0.012, "beam": 8.56e-09, "project": 1.63e-09, "gather": 1.3e-08, "contract": 0}
+SECONDS = {"fixed": 0.00789, "beam": 5.06e-09, "project": 1.81e-09, "gather": 6.88e-09, "contract": 0}
 # CPU seconds of a view: first for every band of wavelengths, then for each moment of it.
-RAY_SECONDS = {"band": 3e-06, "moment": 2.65e-07}
+RAY_SECONDS = {"band": 1.98e-06, "moment": 7.77e-08}
 # MiB beyond imports: fixed, per square of the MiB of the largest table of order 1 (tables along the paths between the
 # nodes grow with the square of those at the nodes), per view evaluated at once.
-MEMORY = {"fixed": 10.7, "square": 0.374, "view": 0.000293}
+MEMORY = {"fixed": 10.9, "square": 0.525, "view": 0.000258}
 # 95th percentile of the error (per cent) by tolerance: clear air, haze, against independent references, their noise
 # included.
-ERRORS = {0.1: (1.1, 0.907), 0.03: (0.725, 0.773), 0.01: (0.4, 0.424), 0.003: (0.271, 0.327), 0.001: (0.222, 0.303)}
+ERRORS = {0.1: (1.1, 0.893), 0.03: (0.713, 0.756), 0.01: (0.395, 0.392), 0.003: (0.264, 0.321), 0.001: (0.222, 0.302)}
 # CPU nanoseconds of a pass of the bare loop of `bare_nanoseconds` on the machine that the constants are from.
-BARE_NANOSECONDS = 3.72
+BARE_NANOSECONDS = 1.96
 # --- end ---
 
 HAZE_DEPTH = 0.05  # optical depth of aerosol from which the second column of ERRORS holds
