@@ -17,7 +17,7 @@ CLOUD = 3.0  # optical depth
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 REMEMBERED = 64  # phase functions whose moments are kept
-REACH_DEGREE = 40  # of the moments that are kept
+REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,10 @@ def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> i
 def moments_of(phase: Any, degree: int) -> np.ndarray:
     """Legendre moments of a phase function at one wavelength, kept."""
     key = (type(phase), float(phase.g)) if hasattr(phase, "g") else phase
-    if key not in _moments:
+    if key not in _moments or len(_moments[key]) <= degree:
         while len(_moments) >= REMEMBERED:
             _moments.pop(next(iter(_moments)))
-        _moments[key] = np.asarray(phase.moments(REACH_DEGREE))
+        _moments[key] = np.asarray(phase.moments(max(REACH_DEGREE, degree)))
     return _moments[key][: degree + 1]
 
 

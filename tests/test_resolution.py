@@ -1,7 +1,11 @@
 """What an atmosphere needs."""
 
+import numpy as np
+import pytest
+
 import atmo_jit
-from atmo_jit.resolution import FIRST_DEGREES, Resolution
+from atmo_jit.phase import HenyeyGreenstein
+from atmo_jit.resolution import FIRST_DEGREES, Resolution, moments_of
 
 EARTH = atmo_jit.Atmosphere.load("earth")
 
@@ -24,3 +28,8 @@ def test_haze_needs_more_moments_the_more_it_peaks():
 def test_fog_needs_more_altitudes_and_accuracy_costs():
     assert suited({"mie.scattering_per_m": 5e-3}).altitudes > suited().altitudes
     assert suited(tolerance=0.001).first_degree > suited().first_degree
+
+
+def test_as_many_moments_as_are_asked_for():
+    few, many = (moments_of(HenyeyGreenstein(0.83), degree) for degree in (10, 60))
+    assert len(few) == 11 and many == pytest.approx(0.83 ** np.arange(61))
