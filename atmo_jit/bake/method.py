@@ -24,7 +24,7 @@ from .tables import Tables4D
 Arrays = list[np.ndarray]
 
 # What a table costs in marched rays: `python -m bench.tables` prints both.
-SKY_VIEW_RAYS, TABLES_RAYS = 2_500, 100_000
+SKY_VIEW_RAYS, TABLES_RAYS = 4_000, 100_000
 # Errors of tables that "auto" allows for: it takes them at tolerances from these on, the 4-D ones for suns by day only.
 SKY_VIEW_TOLERANCE, TABLES_TOLERANCE, TABLES_LOWEST_SUN_DEG = 0.005, 0.02, 80.0
 HORIZON_DEG = 1.0
