@@ -75,7 +75,7 @@ def _distinct(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays that see different skies, and which of them is every ray: the sky is the same on both sides of the sun."""
     turn = np.abs((azimuth + np.pi) % (2.0 * np.pi) - np.pi)
-    rays = np.round(np.column_stack([altitude_m, sun_zenith, view_zenith, turn]), 9)
+    rays = np.column_stack([altitude_m, np.round(np.column_stack([sun_zenith, view_zenith, turn]), 9)])
     order = np.lexsort(rays.T)
     new = np.append(True, np.any(np.diff(rays[order], axis=0) != 0.0, axis=1))
     which = np.empty(len(rays), int)

