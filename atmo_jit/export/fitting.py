@@ -27,35 +27,33 @@ def fitted(
     make: Callable[[tuple[int, int, int, int], Any], ClientTables], to: Bruneton, size: tuple[int, int, int, int]
 ) -> ClientTables:
     """The tables of ``size`` that err least; ``make(size, block)`` computes a block of those of a size."""
-    half_way = 0.5 * (texels(size[3])[1:] + texels(size[3])[:-1])
-    curved = np.flatnonzero((to.sun_inverse(half_way) < STRAIGHT[0]) | (to.sun_inverse(half_way) > STRAIGHT[1]))
+    cosine = to.sun_inverse(0.5 * (texels(size[3])[1:] + texels(size[3])[:-1]))
+    curved = np.flatnonzero((cosine < STRAIGHT[0]) | (cosine > STRAIGHT[1]))  # intervals
     suns = np.sort(np.concatenate([2 * np.arange(size[3]), 2 * curved + 1]))
     found = make((*size[:3], 2 * size[3] - 1), (slice(None), suns))
     node = suns % 2 == 0
+    light = found.scattering[..., node, :]
+    for run in np.split(curved, np.flatnonzero(np.diff(curved) > 1) + 1):
+        if len(run):
+            some = (suns >= 2 * run[0]) & (suns <= 2 * run[-1] + 2)
+            light[..., run[0] : run[-1] + 2, :] = fitted_suns(found.scattering[..., some, :])
     single = found.scattering[..., node, :] - found.higher[..., node, :]
-    higher = np.maximum(fitted_suns(found.scattering, suns) - single, 0.0)
+    higher = np.maximum(light - single, 0.0)
     return replace(found, scattering=single + higher, single_mie=found.single_mie[..., node, :], higher=higher)
 
 
-def fitted_suns(values: np.ndarray, suns: np.ndarray | None = None) -> np.ndarray:
+def fitted_suns(values: np.ndarray) -> np.ndarray:
     """Nodes [A, ..., n, C] of the piecewise linear function of the last axis but one that has the least sum of squared
-    relative errors; none is negative. ``values`` [A, ..., S, C]: the light at ``suns`` [S], all even places from 0 to
-    2 n - 2 (the nodes) and some odd ones (half-way between); default: all."""
-    suns = np.arange(values.shape[-2]) if suns is None else suns
+    relative errors; none is negative. ``values`` [A, ..., 2 n - 1, C]: the light at the nodes and half-way between."""
     with ThreadPoolExecutor() as pool:  # NumPy leaves Python's lock to others
-        return np.stack(list(pool.map(lambda part: _fitted(_finer(part, suns), 4), values)))
+        return np.stack(list(pool.map(lambda part: _fitted(_finer(part), 4), values)))
 
 
-def _finer(values: np.ndarray, suns: np.ndarray) -> np.ndarray:
-    """Light [..., S, C] at four times as many suns as there are nodes: on straight lines where it is known at the nodes
-    alone, else on cubics of its logarithm."""
+def _finer(values: np.ndarray) -> np.ndarray:
+    """Light at twice as many suns [..., 4 n - 3, C]: on cubics of its logarithm."""
     most = np.maximum(values.max(axis=-2, keepdims=True), 1e-30)
-    known = np.log(np.maximum(values, FAINTEST**2 * most))
-    half = np.empty((*values.shape[:-2], int(suns[-1]) + 1, values.shape[-1]), dtype=values.dtype)
-    half[..., suns, :] = known
-    missing = np.setdiff1d(np.arange(half.shape[-2]), suns)
-    half[..., missing, :] = np.log(0.5 * (np.exp(half[..., missing - 1, :]) + np.exp(half[..., missing + 1, :])))
-    out = np.empty((*values.shape[:-2], 2 * int(suns[-1]) + 1, values.shape[-1]), dtype=values.dtype)
+    half = np.log(np.maximum(values, FAINTEST**2 * most))
+    out = np.empty((*values.shape[:-2], 2 * values.shape[-2] - 1, values.shape[-1]), dtype=values.dtype)
     out[..., ::2, :] = half
     middle = out[..., 1::2, :]
     middle[...] = 0.5 * (half[..., 1:, :] + half[..., :-1, :])

@@ -35,12 +35,6 @@ def test_twilight_gets_closer():
     assert fitted_suns(f)[0, 0, 0, :, 0] == pytest.approx(exact, rel=1e-6)
 
 
-def test_suns_left_out_are_on_the_line():
-    x, f = values(lambda x: np.where(x < 0.5, 3.0 ** (8.0 * x), 3.0**4 * (1.0 + x - 0.5)))
-    suns = np.array([*range(0, 9), 10, 12, 14, 16])
-    np.testing.assert_allclose(fitted_suns(f[..., suns, :], suns)[..., 7:, :], f[..., 14::2, :], rtol=1e-3)
-
-
 def test_shadow_stays_dark():
     _, f = values(lambda x: np.maximum(x - 0.5, 0.0) ** 3)
     nodes = fitted_suns(f.astype(np.float32))
