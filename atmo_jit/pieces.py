@@ -30,6 +30,9 @@ from .march import (
 from .optics import Optics
 
 FARTHER = 0.05  # of a piece: a step over which light changes by far more than its rounding
+# Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
+# line, leaves single precision.
+NOTHING = 1e-18
 
 
 @dataclass
@@ -166,8 +169,9 @@ def light_along(
         # What is evaluated here is not run again by the kernels of derivatives.
         *held, centroid, total = evaluated([*one, *weight, centroid, total])
         one, weight = held[:channels], held[channels:]
-        at = dr.fma(length, dr.select(total > 0.0, centroid / dr.select(total > 0.0, total, 1.0), 0.5), start)
-        toward = _asked(optics, source, here, at, length, total > 0.0)
+        scatters = total > NOTHING
+        at = dr.fma(length, dr.select(scatters, centroid / dr.select(scatters, total, 1.0), 0.5), start)
+        toward = _asked(optics, source, here, at, length, scatters)
         for n in range(len(scatterers)):
             for c in range(channels):
                 more[c] = dr.fma(weight[n * channels + c], dr.maximum(toward[n * channels + c], 0.0), more[c])

@@ -172,6 +172,33 @@ def test_derivatives_are_those_of_monte_carlo(reference):
     assert worst["mie.phase.g"] < DERIVATIVE_BY_G
 
 
+def test_derivatives_are_finite_where_pieces_scatter_next_to_nothing():
+    """The top of air 2000 scale heights thick: the square of what a piece scatters there leaves single precision."""
+    air = {
+        "wavelengths_nm": [400.0],
+        "solar_irradiance": 1.0,
+        "ground_albedo": 0.5,
+        "bottom_radius_m": 4.4e6,
+        "top_radius_m": 2.4e7,
+        "rayleigh": None,
+        "mie": {
+            "scattering_per_m": 1.5e-7,
+            "single_scattering_albedo": 0.7,
+            "scale_height_m": 9000,
+            "phase": {"type": "henyey_greenstein", "g": 0.0},
+        },
+        "ozone": None,
+    }
+    views = {
+        "altitude_m": [1.9, 2e6, 67.0, 6900.0, 0.2, 213.0],
+        "sun_zenith_deg": [180.0, 96.5, 80.0, 93.8, 73.6, 100.4],
+        "view_zenith_deg": [90.0, 180.0, 90.3, 90.0, 25.0, 42.2],
+        "azimuth_deg": [287.5, 0.0, 0.0, 180.0, 232.9, 131.7],
+    }
+    at = Linearization(air, views, tolerance=COARSE)
+    assert np.all(np.isfinite(at.jacobian(["mie.scattering_per_m"])["mie.scattering_per_m"]))
+
+
 def test_derivatives_are_finite_where_geometry_is_singular():
     """Zenith, nadir, horizon, ground, top of the air, the sun overhead and underfoot; g = 0 and no aerosol at all."""
     views = {

@@ -79,12 +79,19 @@ def test_nothing_is_lost_in_white_clouds(depth, lost):
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="found and not mended: the derivative by scattering is not finite on ten of fifty rays in air 2000 scale "
-    "heights thick (atmosphere 500), and transmittances are off by 1.3e-3 (506); docs/limits.md",
+    reason="atmosphere 506 has a layer 64 m thick 13,500 km up, where altitudes in single precision are 1 m apart: its "
+    "transmittance is 1.3e-3 off; docs/limits.md",
 )
 def test_more_of_the_sweep():
-    tally = sweep(5000, first=500, per_world=500)
-    sweep_derivatives(300, first=500, tally=tally)
+    holds(sweep(5000, first=500, per_world=500))
+
+
+@pytest.mark.slow
+def test_more_derivatives():
+    holds(sweep_derivatives(300, first=500))
+
+
+def holds(tally):
     rows = tally.rows()
     assert {row[0] for row in rows} <= set(ABOUT) and not tally.failed()
     assert [row for row in rows if row[3] > LIMITS.get(row[0], np.inf)] == []
