@@ -117,6 +117,11 @@ def rayleigh_cosine(sample: Any) -> Any:
 
 def direction(mei: Any, nu: Any, sample: Any) -> Any:
     """World direction at the scattering cosine ``nu`` and a uniform azimuth; ``mei.wi`` points back along the ray."""
+    return mei.to_world(at_cosine(-nu, sample))
+
+
+def at_cosine(nu: Any, sample: Any) -> Any:
+    """Direction at the cosine ``nu`` from the z axis and a uniform azimuth."""
     sine = dr.safe_sqrt(1.0 - nu * nu)
     s, c = dr.sincos(2.0 * dr.pi * sample)
-    return mei.to_world(mi.Vector3f(sine * c, sine * s, -nu))
+    return mi.Vector3f(sine * c, sine * s, nu)

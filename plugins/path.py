@@ -9,11 +9,13 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.errors import AtmosphereError, InputError, shown
+from atmo_jit.phase import HenyeyGreenstein
 from atmo_jit.sky import Sky
 
 from . import settings
 from .airlight import Airlight
 from .colours import Colours
+from .cornette_shanks import at_cosine, henyey_greenstein_cosine
 from .exposed import array, host
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
@@ -360,8 +362,8 @@ class AtmospherePath:
         1, as there is sunlight at a place where it may have been scattered before, a free ``path`` away in the mean;
         if that is on a surface, ``surfaces`` is what sunlight makes of it, there as in the scene without shapes."""
         by_sun = samples[0] < 0.5
-        u = mi.Point2f(dr.select(by_sun, 2.0 * samples[0], 2.0 * samples[0] - 1.0), samples[1])
-        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(henyey_greenstein(u, asymmetry))
+        nu = henyey_greenstein_cosine(asymmetry, 2.0 * samples[0] - dr.select(by_sun, 0.0, 1.0))
+        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(at_cosine(nu, samples[1]))
         there = mi.Ray3f(ray.o, w)
         there.maxt = -path * dr.log(1.0 - samples[2])
         hit = scene.ray_intersect_preliminary(there, active=active)
@@ -370,9 +372,9 @@ class AtmospherePath:
         lost = 1.0 - self._lit(scene, end, toward, active) * dr.select(covers, surfaces, 1.0)
         # More light comes from about the sun. The convolution of two such phase functions, by which the weight has
         # the mean 1, is another, whose asymmetry is the product of theirs.
-        ahead, sunward = (phase_times_4pi(asymmetry, dr.dot(w, axis)) for axis in (ray.d, toward))
+        ahead, sunward = (HenyeyGreenstein(asymmetry).value(dr.dot(w, axis)) for axis in (ray.d, toward))
         weight = 2.0 * ahead * sunward / (ahead + sunward)
-        return lost * weight / phase_times_4pi(asymmetry * asymmetry, dr.dot(ray.d, toward))
+        return lost * weight / HenyeyGreenstein(asymmetry * asymmetry).value(dr.dot(ray.d, toward))
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
@@ -419,19 +421,3 @@ class AtmospherePath:
 def products(one: list[Any], other: list[Any]) -> list[Any]:
     """Wavelength by wavelength."""
     return [a * b for a, b in zip(one, other, strict=True)]
-
-
-def henyey_greenstein(sample: Any, g: Any) -> Any:
-    """A direction about the z axis from Henyey and Greenstein's phase function with asymmetry ``g`` >= 0."""
-    steep = dr.maximum(g, 1e-3)
-    root = (1.0 - steep * steep) / dr.fma(2.0 * steep, sample.x, 1.0 - steep)
-    z = dr.clip((1.0 + steep * steep - root * root) / (2.0 * steep), -1.0, 1.0)
-    sin, cos = dr.sincos(2.0 * dr.pi * sample.y)
-    across = dr.safe_sqrt((1.0 - z) * (1.0 + z))
-    return mi.Vector3f(across * cos, across * sin, z)
-
-
-def phase_times_4pi(g: Any, nu: Any) -> Any:
-    """Henyey and Greenstein's phase function times 4 pi."""
-    base = dr.fma(-2.0 * g, nu, dr.fma(g, g, 1.0))
-    return (1.0 - g * g) / (base * dr.sqrt(base))
