@@ -1,7 +1,7 @@
 """The command ``atmo-jit``: finds the subcommand, runs it, and turns what it raises into one line and an exit status.
 
 Status 0: done. 2: bad usage or bad input (:class:`~atmo_jit.errors.InputError`, click's usage errors). 130:
-interrupted. 1: anything else; ``--debug`` or ``ATMO_JIT_DEBUG=1`` then shows the traceback.
+interrupted by Ctrl-C or SIGTERM. 1: anything else; ``--debug`` or ``ATMO_JIT_DEBUG=1`` then shows the traceback.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import click
 
 from . import __version__
 from .errors import InputError, LLVMError, one_line
+from .interrupts import interrupted_by_signals
 from .llvm import missing_library
 
 # Each is the click command named `command` of the module atmo_jit.commands.<name>, imported only when it is used.
@@ -63,25 +64,29 @@ def group(settings: _Settings, debug: bool) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line (``sys.argv`` if no ``arguments`` are given) and return its exit status."""
     settings = _Settings(debug=os.environ.get("ATMO_JIT_DEBUG", "0") not in ("", "0"))
-    try:
-        status = group.main(arguments, prog_name="atmo-jit", standalone_mode=False, obj=settings)
-        sys.stdout.flush()
-        return status if isinstance(status, int) else 0
-    except click.ClickException as error:
-        return _fail(error.format_message(), 2, settings)
-    except InputError as error:
-        return _fail(str(error), 2, settings)
-    except (click.Abort, KeyboardInterrupt):
-        return _fail("interrupted", 130, settings)
-    except BrokenPipeError:
+    with interrupted_by_signals() as interrupt:
+        try:
+            status = group.main(arguments, prog_name="atmo-jit", standalone_mode=False, obj=settings)
+            sys.stdout.flush()
+            return status if isinstance(status, int) else 0
+        except (Exception, KeyboardInterrupt) as error:
+            # Within a library's own code an interrupt may have become another exception.
+            if interrupt.asked or isinstance(error, KeyboardInterrupt | click.Abort):
+                return _fail("interrupted", 130, settings)
+            return _failed(error, settings)
+
+
+def _failed(error: Exception, settings: _Settings) -> int:
+    if isinstance(error, BrokenPipeError):
         # The reader of our output went away (`atmo-jit info | head`): nothing to say, and nobody to say it to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except LLVMError as error:
-        return _fail(str(error), 1, settings)
-    except Exception as error:
-        text = missing_library(error) or f"{type(error).__name__}: {error} (atmo-jit --debug shows where)"
-        return _fail(text, 1, settings)
+    if isinstance(error, click.ClickException):
+        return _fail(error.format_message(), 2, settings)
+    if isinstance(error, InputError | LLVMError):
+        return _fail(str(error), 2 if isinstance(error, InputError) else 1, settings)
+    text = missing_library(error) or f"{type(error).__name__}: {error} (atmo-jit --debug shows where)"
+    return _fail(text, 1, settings)
 
 
 def _fail(text: str, status: int, settings: _Settings) -> int:

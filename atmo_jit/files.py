@@ -26,6 +26,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from .errors import InputError, shown
+from .interrupts import uninterrupted
 
 # Larger archives are more likely a mistake or an attack than a list of views (this holds 26 million of them).
 NPZ_LIMIT = 2**31
@@ -91,19 +92,22 @@ def atomic_outputs(*paths: Path) -> Iterator[tuple[Path, ...]]:
         _remove_stale(folder)
     parts: list[Path] = []
     try:
-        for target in targets:
-            parts.append(_create(target))
+        with uninterrupted():
+            for target in targets:
+                parts.append(_create(target))
         yield tuple(parts)
         for part in parts:
             _sync(part)
-        for part, target in zip(parts, targets, strict=True):
-            os.replace(part, target)
+        with uninterrupted():  # all of them or none
+            for part, target in zip(parts, targets, strict=True):
+                os.replace(part, target)
         for folder in {target.parent for target in targets}:
             _sync(folder)
     finally:
-        for part in parts:
-            with suppress(OSError):  # renamed already, or gone with its folder
-                part.unlink(missing_ok=True)
+        with uninterrupted():
+            for part in parts:
+                with suppress(OSError):  # renamed already, or gone with its folder
+                    part.unlink(missing_ok=True)
 
 
 def read_npz(path: str | os.PathLike[str], *, kinds: str = KINDS, limit: int = NPZ_LIMIT) -> dict[str, np.ndarray]:

@@ -47,7 +47,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
 # The command line, where files cannot grow beyond some bytes, and which a shell's background job does not make deaf.
 LIMITED = """
 import resource, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python starts, an interrupt just ends it
 if (limit := int(sys.argv[1])) >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 from atmo_jit.cli import main

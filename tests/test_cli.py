@@ -106,15 +106,26 @@ def test_debug_shows_the_traceback(broken, capsys, monkeypatch, by_option):
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_an_interrupt_ends_with_130_and_a_line():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("end", ["time.sleep(60)", "no_other_way_out()", "Ignored(); time.sleep(60)"])
+def test_an_interrupt_ends_with_130_and_a_line(number, end):
+    # What a library makes of an interrupt within its own code may be another exception.
     # Jobs that a shell starts in the background ignore interrupts, and so would all processes below them.
     code = (
         "import signal, sys, time, types, click\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def no_other_way_out():\n"
+        "    try:\n"
+        "        time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n"
+        "        raise RuntimeError('lost') from None\n"
+        "class Ignored:\n"
+        "    def __del__(self):\n"
+        "        time.sleep(60)\n"
         "@click.command()\n"
         "def command():\n"
         "    print('ready', flush=True)\n"
-        "    time.sleep(60)\n"
+        f"    {end}\n"
         "sys.modules['atmo_jit.commands.info'] = types.SimpleNamespace(command=command)\n"
         "from atmo_jit.cli import main\n"
         "sys.exit(main(['info']))"
@@ -124,7 +135,7 @@ def test_an_interrupt_ends_with_130_and_a_line():
         try:
             assert process.stdout.readline() == "ready\n"
             time.sleep(0.1)
-            process.send_signal(signal.SIGINT)
+            process.send_signal(number)
             _, errors = process.communicate(timeout=30)
         finally:
             process.kill()

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from atmo_jit.interrupts import deferred_interrupts
+from atmo_jit.interrupts import deferred_interrupts, interrupted_by_signals, uninterrupted
 
 
 @pytest.fixture(autouse=True)
@@ -49,3 +49,22 @@ def test_other_threads_just_run():
     thread.start()
     thread.join()
     assert seen == [False]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_commands_and_wait_for_what_must_be_whole(number):
+    before, done = signal.getsignal(number), []
+    with pytest.raises(KeyboardInterrupt), interrupted_by_signals() as interrupt:
+        with uninterrupted():
+            os.kill(os.getpid(), number)
+            done.append(interrupt.asked)
+        done.append("never")
+    assert done == [False] and interrupt.asked and signal.getsignal(number) is before
+
+
+def test_what_waits_is_sent_on_to_a_block_that_waits_too():
+    with deferred_interrupts() as interrupt:
+        with uninterrupted():
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert not interrupt.asked
+        assert interrupt.asked
