@@ -26,19 +26,25 @@ def interrupted_by_signals() -> Iterator[Interrupt]:
     another one. Where Python could only ignore it (in a destructor, or a callback of the garbage collector), and where
     a library could not take it (while a module is imported), it is raised a little later.
     """
-    interrupt, ignored, last = Interrupt(), sys.unraisablehook, signal.SIGINT
+    interrupt, ignored = Interrupt(), sys.unraisablehook
+    last, later = signal.SIGINT, None
 
     def end(number: int, frame: FrameType | None) -> None:
         nonlocal last
         interrupt.asked, last = True, number
-        if _importing(frame):
-            _send_later(number)
-        else:
+        if not _importing(frame):
             raise KeyboardInterrupt
+        send_later()
+
+    def send_later() -> None:
+        nonlocal later
+        later = threading.Timer(AGAIN_SECONDS, _send, (last,))
+        later.daemon = True
+        later.start()
 
     def again(lost: sys.UnraisableHookArgs) -> None:
         if interrupt.asked and issubclass(lost.exc_type, KeyboardInterrupt):
-            _send_later(last)
+            send_later()
         elif not interrupt.asked:  # afterwards half-made objects complain that they are half-made
             ignored(lost)
 
@@ -48,6 +54,8 @@ def interrupted_by_signals() -> Iterator[Interrupt]:
             yield interrupt
         finally:
             sys.unraisablehook = ignored
+            if later:  # what is done cannot be interrupted
+                later.cancel()
 
 
 @contextmanager
@@ -108,12 +116,6 @@ def _importing(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _send_later(number: int) -> None:
-    later = threading.Timer(AGAIN_SECONDS, _send, (number,))
-    later.daemon = True
-    later.start()
 
 
 def _send(number: int) -> None:

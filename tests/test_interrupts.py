@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
+import time
 
 import pytest
 
@@ -68,3 +70,26 @@ def test_what_waits_is_sent_on_to_a_block_that_waits_too():
             os.kill(os.getpid(), signal.SIGTERM)
             assert not interrupt.asked
         assert interrupt.asked
+
+
+def test_imports_are_whole_before_an_interrupt(tmp_path, monkeypatch):
+    # Extension modules that see an exception while they are set up may abort the process.
+    name = "atmo_jit_imported_by_a_test"
+    (tmp_path / f"{name}.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.05)\nwhole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt), interrupted_by_signals():
+        __import__(name)
+        time.sleep(10)
+    assert sys.modules.pop(name).whole
+
+
+def test_a_late_interrupt_of_what_is_done_is_forgotten(tmp_path, monkeypatch):
+    name = "atmo_jit_imported_last_by_a_test"
+    (tmp_path / f"{name}.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with interrupted_by_signals() as interrupt:
+        __import__(name)
+    time.sleep(0.05)
+    assert interrupt.asked and sys.modules.pop(name)
