@@ -13,10 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import row
 from atmo_jit.bake.source import SourceTable
 from atmo_jit.geometry import altitude_along, hits_ground
-from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, relative_azimuth, visible_sun
+from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, visible_sun
 from atmo_jit.quadrature import gauss_legendre
 from atmo_jit.resolution import moments_of
 from atmo_jit.single_scattering import disc_cosine
@@ -26,8 +25,7 @@ from .exposed import number
 from .globe import Globe
 
 NODES = 2  # of each piece of a ray; `python -m bench.airlight` has what that costs beside the four of Sky.rays
-# Of random numbers from point to point of a ray: powers of the inverse of the root of x^5 = x + 1 (M. Roberts 2018).
-STEPS = [1.1673039782614187**-n for n in range(1, 5)]
+STEP = 0.6180339887498949  # of random numbers from point to point of a ray: the golden ratio's
 QUADRATURE = gauss_legendre(4)
 FIRST_PARTS = 4  # of the way to where shadows may begin
 FULL_DEPTH = 0.25  # optical depth from which a stretch gets all of its points
@@ -61,8 +59,8 @@ class Airlight:
         for shells in self._shells:
             shells.rule(NODES)
         # These say where shadows are looked for.
-        self._guide, self._guide_beam = self.bands[0].optics, self._beams[0]
-        self._asymmetry = asymmetry(self.bands[0])
+        self.guide = self.bands[0].optics
+        self.asymmetry = asymmetry(self.bands[0])
         self.count = len(sky.atmosphere.wavelengths_nm)
         ground = [band.optics.largest_extinction(band.optics.densities(mi.Float(0.0))) for band in self.bands]
         self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
@@ -71,9 +69,7 @@ class Airlight:
 
     def _take(self, sky: Sky) -> None:
         self.bands = sky.bands
-        # Light of one order has nothing but the sun's own beam to lose.
-        self._beams = [beam_extinction(band, scaled=sky.orders != 1) for band in self.bands]
-        self._sources = [band.source and SourceTable(band.field) for band in self.bands]
+        self.sources = [band.source and SourceTable(band.field) for band in self.bands]
 
     def moved(self, sky: Sky) -> Airlight:
         """The light of another sky, at the points and by the pieces of rays that serve this one."""
@@ -109,7 +105,7 @@ class Airlight:
         rays.ground &= meets & (left >= rays.stop)
         rays.stop = dr.select(meets, dr.minimum(rays.stop, left), 0.0)
         found = Stretch([], [], rays.ground, (gap + rays.stop) * scale, rays, gap)
-        for band, source, shells in zip(self.bands, self._sources, self._shells, strict=True):
+        for band, source, shells in zip(self.bands, self.sources, self._shells, strict=True):
             light = march(band.optics, band.columns, rays, nodes=NODES, source=source, shells=shells)
             found.light += [a + b for a, b in zip(light.single, light.multiple, strict=True)]
             found.transmittance += light.transmittance
@@ -122,7 +118,7 @@ class Airlight:
         found = []
         for band in self.bands:
             sky = band.field.irradiance(zero, mu_s, reflected=True)
-            sun = self._sunlight(band, zero, mu_s, disc_cosine(mu_s, band.optics.sun_radius) * lit)
+            sun = self.sunlit(band, zero, mu_s, disc_cosine(mu_s, band.optics.sun_radius) * lit)
             found += [a * dr.inv_pi * (d + s) for a, d, s in zip(band.optics.albedo, sun, sky, strict=True)]
         return found
 
@@ -141,81 +137,52 @@ class Airlight:
         seen = dr.select(hits_ground(optics.radius, h, mu) & inside, 0.0, 1.0)
         found = []
         for band in self.bands:
-            found += self._sunlight(band, h, mu, seen)
+            found += self.sunlit(band, h, mu, seen)
         return found
 
-    def _sunlight(self, band: Any, h: Any, mu: Any, factor: Any) -> list[Any]:
+    def sunlit(self, band: Any, h: Any, mu: Any, factor: Any) -> list[Any]:
         optics = band.optics
         depths = optics.optical_depths(band.columns.toward(h, mu)) if optics.constituents else [0.0] * len(optics.solar)
         return [e * factor * dr.exp(-depth) for e, depth in zip(optics.solar, depths, strict=True)]
 
     def shade(
-        self,
-        part: Stretch,
-        start: Any,
-        end: Any,
-        samples: Any,
-        most: int,
-        lit: Callable[[Any], Any],
-        around: Callable[..., Any],
+        self, part: Stretch, start: Any, end: Any, sample: Any, most: int, lit: Callable[[Any], Any]
     ) -> list[Any]:
-        """Light (radiance, W) that is missing from a stretch because shapes keep the sun from it.
+        """Light of order 1 (radiance, W) that is missing from a stretch because shapes keep the sun from it.
 
         They can do so only between the distances ``start`` and ``end`` (scene units). There up to ``most`` points are
         drawn, fewer where little is scattered: one from each of as many parts of equal weight exp(-distance x
-        extinction at the start), by the first of the four random numbers ``samples``. ``lit`` says whether the sun is
-        seen (1 or 0) from a distance along the ray. That keeps away order 1, and of higher orders what comes from so
-        near the sun that the same shapes are in its way (:func:`beam_extinction`). ``around`` says how much of the rest
-        is missing there, given three more random numbers, light's mean free path (scene units), the asymmetry of its
-        scattering, and how bright sunlit surfaces are beside the air."""
+        extinction at the start), by the random number ``sample``. ``lit`` says whether the sun is seen (1 or 0) from a
+        distance along the ray."""
         rays, scale = part.rays, self.globe.scale
         optics = self.bands[0].optics
         first = dr.clip(start * (1.0 / scale) - part.gap, 0.0, rays.stop)
         length = dr.clip(end * (1.0 / scale) - part.gap, 0.0, rays.stop) - first
         before = [0.0 for _ in optics.constituents]
-        amounts = self._columns(rays, dr.zeros(mi.Float, dr.width(first)), first, before, FIRST_PARTS)
+        amounts = self.columns(rays, dr.zeros(mi.Float, dr.width(first)), first, before, FIRST_PARTS)
         h, _, _ = point_along(optics, rays, first)
-        rate = dr.maximum(self._guide.largest_extinction(self._guide.densities(h)), LEAST_EXTINCTION)
+        rate = dr.maximum(self.guide.largest_extinction(self.guide.densities(h)), LEAST_EXTINCTION)
         rest = dr.exp(-rate * length)
         count = dr.clip(dr.ceil(most * (1.0 - rest) / FULL_DEPTH), 1.0, float(most))
         count = dr.select(length > 0.0, count, 0.0)
         phases = [{k: band.optics.phase_values(k, rays.nu) for k in band.optics.scatterers} for band in self.bands]
-        # What is scattered once more changes slowly: the field is asked once, in the middle.
-        middle = first - dr.log(dr.fma(0.5, rest - 1.0, 1.0)) / rate
-        later = self._later(rays, middle, length > 0.0)
-        surfaces = None if later is None else self._surfaces(rays, middle, later)
 
         def part_of(i: Any, d: Any, amounts: list[Any], sums: list[Any]) -> tuple[Any, ...]:
-            jitter, *others = (u + i * step for u, step in zip(samples, STEPS, strict=True))
+            jitter = sample + i * STEP
             s = (i + (jitter - dr.floor(jitter))) / count
             left = dr.fma(s, rest - 1.0, 1.0)
             there = dr.minimum(first - dr.log(left) / rate, first + length)
-            amounts = self._columns(rays, d, there, amounts, 1)
+            amounts = self.columns(rays, d, there, amounts, 1)
             h, r, mu_s = point_along(optics, rays, there)
-            inverse_density = (1.0 - rest) / (rate * left * count)
-            place = (part.gap + there) * scale
-            dark = 1.0 - lit(place)
-            shining = visible_sun(optics, h, r, mu_s)
-            path = self._mean_path(self._guide.densities(h)) * scale
-            others = [u - dr.floor(u) for u in others]
-            less = 0.0 if later is None else around(place, others, path, self._asymmetry, surfaces)
+            dark = (1.0 - lit((part.gap + there) * scale)) * (1.0 - rest) / (rate * left * count)
+            shining = dark * visible_sun(optics, h, r, mu_s)
             new = []
-            for b, (band, beam, values) in enumerate(zip(self.bands, self._beams, phases, strict=True)):
+            for band, values in zip(self.bands, phases, strict=True):
                 o = band.optics
-                here, toward = o.densities(h), band.columns.toward(h, mu_s)
-                depths = zip(o.optical_depths(amounts), o.optical_depths(toward), strict=True)
-                for c, (depth, whole) in enumerate(depths):
-                    seen = dr.exp(-depth) * inverse_density
-                    beams = shining * o.solar[c] * dr.exp(-sum(e[c] * n for e, n in zip(beam, toward, strict=True)))
-                    alone = shining * o.solar[c] * dr.exp(-whole)
-                    total = 0.0
-                    for n, k in enumerate(o.scatterers):
-                        lost = values[k][c] * beams * dark
-                        if later is not None:
-                            wide = dr.maximum(later[b][n][c] - values[k][c] * (beams - alone), 0.0)
-                            lost = dr.fma(wide, less, lost)
-                        total += o.scattering[k][c] * here[k] * lost
-                    new.append(total * seen)
+                here, seen = o.densities(h), o.optical_depths(amounts)
+                for c, light in enumerate(self.sunlit(band, h, mu_s, shining)):
+                    scattering = sum(o.scattering[k][c] * here[k] * values[k][c] for k in o.scatterers)
+                    new.append(scattering * light * dr.exp(-seen[c]))
             return i + 1.0, there, amounts, [a + b for a, b in zip(sums, new, strict=True)]
 
         zero = dr.zeros(mi.Float, dr.width(first))
@@ -223,35 +190,7 @@ class Airlight:
         *_, sums = dr.while_loop(state, lambda i, *_: i < count, part_of, label="shafts")
         return sums
 
-    def _later(self, rays: Rays, distance: Any, active: Any) -> list[list[list[Any]]] | None:
-        """Integral of phase function times radiance of later orders at a distance (m): [band][scatterer][channel];
-        None: there is none."""
-        if any(source is None for source in self._sources):
-            return None
-        optics = self.bands[0].optics
-        h, r, mu_s = point_along(optics, rays, distance)
-        mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -1.0, 1.0)
-        azimuth = relative_azimuth(mu, mu_s, rays.nu)
-        return [source.scattered(h, mu_s, mu, azimuth, active) for source in self._sources]
-
-    def _surfaces(self, rays: Rays, distance: Any, later: list[list[list[Any]]]) -> Any:
-        """Radiance of sunlit surfaces over that of the air around: those of the ground's albedo, horizontal, and at
-        most 1."""
-        band, (light, *_) = self.bands[0], later
-        optics = band.optics
-        h, r, mu_s = point_along(optics, rays, distance)
-        sun = self._sunlight(band, h, mu_s, visible_sun(optics, h, r, mu_s) * dr.maximum(mu_s, 0.0) * dr.inv_pi)
-        air = sum(values[c] for values in light for c in range(optics.channel_count)) * (1.0 / len(light))
-        own = sum(a * s for a, s in zip(optics.albedo, sun, strict=True))
-        grey = sum(optics.albedo) * (1.0 / optics.channel_count)
-        return dr.clip(own / dr.maximum(air, 1e-30) + grey, 0.0, 1.0)
-
-    def _mean_path(self, densities: list[Any]) -> Any:
-        """Mean free path (m) of light between scatterings that turn it, mean over the wavelengths of a band."""
-        total = sum(sum(e) * (1.0 / len(e)) * n for e, n in zip(self._guide.extinction, densities, strict=True))
-        return 1.0 / dr.maximum(total, LEAST_EXTINCTION)
-
-    def _columns(self, rays: Rays, start: Any, end: Any, amounts: list[Any], parts: int) -> list[Any]:
+    def columns(self, rays: Rays, start: Any, end: Any, amounts: list[Any], parts: int) -> list[Any]:
         """Column densities (m) of all constituents up to ``end``, given those up to ``start``."""
         optics = self.bands[0].optics
         length = (end - start) * (1.0 / parts)
@@ -260,24 +199,6 @@ class Airlight:
                 h, _ = altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, float(x) + i, start))
                 amounts = [dr.fma(length * float(w), v, a) for v, a in zip(optics.densities(h), amounts, strict=True)]
         return amounts
-
-
-def beam_extinction(band: Any, *, scaled: bool) -> list[Any]:
-    """Extinction (1/m) [constituent][channel] of what shapes take away when they shade the air: of sunlight, and,
-    ``scaled``, of the light that was scattered so little aside that the same shapes are in its way.
-
-    Of every scattering the part chi_2, the second moment of the phase function, counts as not scattered (Joseph,
-    Wiscombe and Weinman 1976)."""
-    optics, count = band.optics, band.optics.channel_count
-    size = len(optics.scatterers) * count
-    # Row 2 of the phase moments.
-    chi = row(optics.phase_moments(band.field.degree), mi.UInt32(2), size) if size and scaled else []
-    found = [list(values) for values in optics.extinction]
-    for n, k in enumerate(optics.scatterers if chi else ()):
-        for c in range(count):
-            found[k][c] = found[k][c] - chi[n * count + c] * optics.scattering[k][c]
-    dr.eval(found)
-    return found
 
 
 def asymmetry(band: Any) -> Any:

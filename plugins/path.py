@@ -9,17 +9,16 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.errors import AtmosphereError, InputError, shown
-from atmo_jit.phase import HenyeyGreenstein
 from atmo_jit.sky import Sky
 
 from . import settings
 from .airlight import Airlight
 from .colours import Colours
-from .cornette_shanks import at_cosine, henyey_greenstein_cosine
 from .exposed import array, host
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
 from .linearized import Changes, LinearizedSky, unit_changes
+from .shaded_air import later_orders
 from .shadow_volume import shadowed_interval
 from .skylight import Skylight
 from .volpath import mis_weight, unpolarized
@@ -28,7 +27,6 @@ from .volpath import mis_weight, unpolarized
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
-BEFORE = 0.999  # of the way to a shape: light is scattered before it
 SCALES = ("sun_scale", "sky_scale")
 TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
@@ -78,7 +76,7 @@ class AtmospherePath:
      * - shaft_samples
        - |int|
        - Points of each segment, at most, at which it is found out whether shapes keep the sun from the air: shafts of
-         light and shadow. 0 leaves them out. (Default: 8)
+         light and shadow. 0 leaves them out, and with them all that shapes keep from the air. (Default: 8)
 
      * - aovs
        - |string|
@@ -90,9 +88,10 @@ class AtmospherePath:
     surface to the next, and to the camera, the air takes its part of the light and adds what it scatters. That is
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
-    points, more where it scatters more. Scenes too small for that to matter skip it. With the sun goes the light that
-    has been scattered forward, from about the sun; how much of the other light of higher orders is missing is an
-    estimate, by one place for each point at which it may have been scattered before (docs/gallery.md says how good).
+    points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders that shapes
+    keep from a segment, and that their surfaces add, is found by one random walk from a point of it, without bias but
+    with noise (docs/gallery.md has both). Two things in it are simplified: surfaces count as diffuse, and of the sky
+    they see what their slope leaves of it, whatever else is in the way.
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.
@@ -247,18 +246,19 @@ class AtmospherePath:
             shows = active & (surface | (depth > 0) | ~mi.Bool(self.hide_emitters))
 
             grounded = active & part.ground & ~surface
-            inscatter = self._inscatter(scene, sampler, ray, part, light, air, active)
+            inscatter, surfaces = self._inscatter(scene, sampler, ray, part, light, air, colours, passed, active)
             lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
             disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
             disc = dr.select(active & ~surface & ~grounded, disc, 0.0)
             ground = air.on_ground(ray(part.distance), lit)
             arriving = light.sum(passed, inscatter, part.transmittance, ground, grounded, disc)
-            result += dr.select(shows, reflected * colours.of(arriving, ray.wavelengths), 0.0)
+            arriving = colours.of(arriving, ray.wavelengths) + surfaces * light.sky_scale
+            result += dr.select(shows, reflected * arriving, 0.0)
             seen |= shows
             passed = products(passed, part.transmittance)
             if dr.hint(len(self.aovs) > 0, mode="scalar"):
                 start = depth == 0
-                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths), first_light)
+                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths) + surfaces, first_light)
                 first_passed = dr.select(start, colours.white(part.transmittance, ray.wavelengths), first_passed)
 
             # Lamps that the ray meets.
@@ -328,53 +328,35 @@ class AtmospherePath:
         return mi.Spectrum(result), seen, aovs
 
     def _inscatter(
-        self, scene: Any, sampler: Any, ray: Any, part: Any, light: Skylight, air: Airlight, active: Any
-    ) -> list[Any]:
-        """What the air of a segment scatters, less what shapes keep the sun from."""
+        self,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        part: Any,
+        light: Skylight,
+        air: Airlight,
+        colours: Colours,
+        passed: list[Any],
+        active: Any,
+    ) -> tuple[list[Any], Any]:
+        """What the air of a segment scatters, less what shapes keep from it (W); and what it scatters of their
+        surfaces' light, after the air that the path has ``passed``."""
         if not self._shades(scene, air):
-            return part.light
+            return part.light, mi.UnpolarizedSpectrum(0.0)
         toward = light.toward_sun(sampler.next_2d(active))
         start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
-        samples = [sampler.next_1d(active) for _ in range(4)]
+        sample = sampler.next_1d(active)
 
         def lit(distance: Any) -> Any:
             return self._lit(scene, ray(distance), toward, active)
 
-        def around(distance: Any, *how: Any) -> Any:
-            return self._missing(scene, mi.Ray3f(ray(distance), ray.d), toward, air.globe, active, *how)
-
-        missing = air.shade(part, start, end, samples, self.shaft_samples, lit, around)
-        return [a - b for a, b in zip(part.light, missing, strict=True)]
-
-    def _missing(
-        self,
-        scene: Any,
-        ray: Any,
-        toward: Any,
-        globe: Globe,
-        active: Any,
-        samples: list[Any],
-        path: Any,
-        asymmetry: Any,
-        surfaces: Any,
-    ) -> Any:
-        """How much of the light that is scattered along a ray, back to its origin, is missing because of shapes: 0 or
-        1, as there is sunlight at a place where it may have been scattered before, a free ``path`` away in the mean;
-        if that is on a surface, ``surfaces`` is what sunlight makes of it, there as in the scene without shapes."""
-        by_sun = samples[0] < 0.5
-        nu = henyey_greenstein_cosine(asymmetry, 2.0 * samples[0] - dr.select(by_sun, 0.0, 1.0))
-        w = mi.Frame3f(dr.select(by_sun, toward, ray.d)).to_world(at_cosine(nu, samples[1]))
-        there = mi.Ray3f(ray.o, w)
-        there.maxt = -path * dr.log(1.0 - samples[2])
-        hit = scene.ray_intersect_preliminary(there, active=active)
-        end = there(dr.select(hit.is_valid(), BEFORE * hit.t, there.maxt))
-        covers = hit.is_valid() & (globe.altitude(there(there.maxt)) > 0.0)  # not the ground, which is always there
-        lost = 1.0 - self._lit(scene, end, toward, active) * dr.select(covers, surfaces, 1.0)
-        # More light comes from about the sun. The convolution of two such phase functions, by which the weight has
-        # the mean 1, is another, whose asymmetry is the product of theirs.
-        ahead, sunward = (HenyeyGreenstein(asymmetry).value(dr.dot(w, axis)) for axis in (ray.d, toward))
-        weight = 2.0 * ahead * sunward / (ahead + sunward)
-        return lost * weight / HenyeyGreenstein(asymmetry * asymmetry).value(dr.dot(ray.d, toward))
+        missing = air.shade(part, start, end, sample, self.shaft_samples, lit)
+        surfaces = mi.UnpolarizedSpectrum(0.0)
+        if None not in air.sources:
+            most = None if self.orders is None else self.orders - 1
+            later, surfaces = later_orders(air, scene, sampler, ray, part, toward, passed, colours, most, active)
+            missing = [a + b for a, b in zip(missing, later, strict=True)]
+        return [a - b for a, b in zip(part.light, missing, strict=True)], surfaces
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""

@@ -34,6 +34,19 @@ HAZE = {
     "ground_albedo": [0.0],
     "sun_angular_radius_deg": 0.26,
 }
+LOW_SUN = np.array([0.08, 1.0, 0.1]) / np.linalg.norm([0.08, 1.0, 0.1])
+DUST = {
+    **HAZE,
+    "bottom_radius_m": 3389500,
+    "top_radius_m": 3489500,
+    "rayleigh": {"scattering_per_m": [2.45e-7], "scale_height_m": 11000},
+    "mie": {
+        "scattering_per_m": [3.909e-5],
+        "single_scattering_albedo": [0.86],
+        "scale_height_m": 11000,
+        "phase": {"type": "henyey_greenstein", "g": 0.775},
+    },
+}
 
 
 def passes(scene, count, spp):
@@ -92,9 +105,9 @@ def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
     assert_agree(*found)
 
 
-def shaded(integrator, orders=None, grey=0.0, **options):
+def shaded(integrator, orders=None, grey=0.0, air=HAZE, sun=SUN, **options):
     """Two towers, kilometres high, black or grey, between the camera and the sun, in haze."""
-    at, atmosphere = mi.ScalarTransform4f(), atmo_jit.Atmosphere.load(HAZE)
+    at, atmosphere = mi.ScalarTransform4f(), atmo_jit.Atmosphere.load(air)
     black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": grey}}
     towers = {
         "west": {"type": "cube", "to_world": at.translate([-1200, 6000, 1300]).scale([900, 400, 1500]), "bsdf": black},
@@ -102,7 +115,7 @@ def shaded(integrator, orders=None, grey=0.0, **options):
     }
     sensor = camera(48, 32, [0, 0, 100], [0, 1000, 260], far_clip=1e8)
     if integrator == "atmosphere_path":
-        sky = {"type": "atmosphere", "atmosphere": json.dumps(HAZE), "sun_direction": SUN.tolist(), "altitude": 0.0}
+        sky = {"type": "atmosphere", "atmosphere": json.dumps(air), "sun_direction": sun.tolist(), "altitude": 0.0}
         sky["sun_scale"] = 0.0  # the disc itself would only add noise
         orders = {} if orders is None else {"orders": orders}
         depth = 1 if grey == 0.0 else 3
@@ -110,9 +123,10 @@ def shaded(integrator, orders=None, grey=0.0, **options):
     else:
         from atmo_jit.plugins.planet import planet
 
-        parts = planet(atmosphere, sun_direction=SUN, sun_radius_deg=0.26)
+        parts = planet(atmosphere, sun_direction=sun, sun_radius_deg=0.26)
         sensor["medium"] = parts.pop("air")
-        parts["integrator"] = {"type": integrator, "max_depth": orders + 1, "hide_emitters": True}
+        depth = -1 if orders is None else orders + 1
+        parts["integrator"] = {"type": integrator, "max_depth": depth, "hide_emitters": True}
     return mi.load_dict({"type": "scene", "sensor": sensor, **parts, **towers})
 
 
@@ -126,6 +140,26 @@ def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
     # The shadows are there, and what is known of them is known well.
     assert np.max(without / estimates[1].mean) > 1.5
     assert np.median(np.sqrt(estimates[1].variance) / estimates[1].mean) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("orders", "grey"), [(2, 0.0), pytest.param(None, 0.4, marks=pytest.mark.slow)], ids=["two", "all"]
+)
+def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders, grey):
+    """Dust in which a low sun's beam is spent: nearly all light is of order 2 and more, and the towers hide where it
+    comes from also where they cast no shadow."""
+    mi.set_variant("llvm_ad_mono")
+    scenes = [shaded(f"atmosphere_{name}", orders, grey, air=DUST, sun=LOW_SUN) for name in ("path", "volpath")]
+    samples = (16, 128) if orders else (128, 1024)
+    own, truth = (of_passes(tiles(passes(scene, 16, n), 8)) for scene, n in zip(scenes, samples, strict=True))
+    free = shaded("atmosphere_path", orders, grey, air=DUST, sun=LOW_SUN, shaft_samples=0)
+    without = tiles(passes(free, 1, 8), 8)[0]
+    for estimate in (own, truth):  # what two nodes a piece and a table of the field cost
+        estimate.variance[:] += (0.004 * truth.mean) ** 2
+    assert_agree(own, truth)
+    # Shapes take light away, and what is known of it is known well.
+    assert np.max(without / truth.mean) > 1.2
+    assert np.median(np.sqrt(truth.variance) / truth.mean) < 0.02
 
 
 def test_instances_are_the_shapes_that_they_stand_for(plugins):
