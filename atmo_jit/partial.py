@@ -9,6 +9,7 @@ from typing import Any
 
 from .errors import InputError, shown
 
+KEEP_SECONDS = 20.0  # between the states that long work writes on the way
 _DIGITS = 16  # of a SHA-256 in hexadecimal: nobody makes two inputs alike here, and messages stay short
 
 

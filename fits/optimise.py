@@ -27,6 +27,8 @@ UNKNOWN = 1e-14  # of the largest curvature, below which there is none
 DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
 
+Progress = Callable[[int, float, np.ndarray], None]
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -141,10 +143,11 @@ def minimise(
     method: str = "levenberg_marquardt",
     max_iterations: int = MAX_ITERATIONS,
     step_tolerance: float = STEP_TOLERANCE,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Solution:
     """Minimise the sum of the loss from ``start``. ``step_tolerance``: a step that gains less than this part of the
-    standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration and cost.
+    standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration, the
+    least cost so far, and where that is.
     """
     run = {"levenberg_marquardt": _levenberg_marquardt, "lbfgsb": _lbfgsb}[method]
     jax, _ = _jaxopt()
@@ -234,7 +237,7 @@ _steps_for = lru_cache(maxsize=16)(_Steps)
 
 
 def _levenberg_marquardt(
-    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Progress
 ) -> Solution:
     """Steps of :class:`_Steps` until they gain nothing."""
     steps, u = _steps_for(len(start)), start
@@ -250,8 +253,8 @@ def _levenberg_marquardt(
         step, now = state.delta, functions.cost(u + state.delta)
         if not np.all(np.isfinite(step)):
             return done(u, iteration, False, "the data do not depend on a parameter: no step exists")
-        progress(iteration, min(now, best))
         gain = best - now
+        progress(iteration, min(now, best), u_next if gain > 0.0 else u)
         if gain > 0.0:
             best = steps.best = now
             u, failures = u_next, 0
@@ -272,7 +275,7 @@ def _levenberg_marquardt(
 
 
 def _lbfgsb(
-    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Progress
 ) -> Solution:
     """L-BFGS-B (Byrd et al. 1995) on the sum itself: SciPy's by way of jaxopt, whose own takes a minute to trace."""
     _, jaxopt = _jaxopt()
@@ -285,7 +288,7 @@ def _lbfgsb(
     def after(u: Any) -> None:
         points.append(np.array(u, dtype=float))
         change = functions.cost(points[-2]) - functions.cost(points[-1])
-        progress(len(points) - 1, functions.cost(points[-1]))
+        progress(len(points) - 1, functions.cost(points[-1]), points[-1])
         # How far Newton's step would lead.
         ahead = functions.small(u, functions.cost(u))[0][:-1]
         if np.linalg.norm(ahead) < enough * np.sqrt(len(ahead)):

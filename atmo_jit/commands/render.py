@@ -19,11 +19,9 @@ from atmo_jit.files import atomic_outputs, check_output
 from atmo_jit.image import Picture, display, write_exr, write_png
 from atmo_jit.interrupts import deferred_interrupts
 from atmo_jit.kept_passes import KeptPasses
+from atmo_jit.partial import KEEP_SECONDS
 from atmo_jit.passes import PASS_SAMPLES, REFERENCE_PASS_SAMPLES, Passes
 from atmo_jit.progress import progress_bar
-
-# Seconds between the pictures that a --reference render leaves on the way.
-KEEP_SECONDS = 20.0
 
 
 @click.command()
