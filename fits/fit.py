@@ -25,7 +25,7 @@ from .config import FitConfig
 from .forward import ROUGH
 from .kept import Point, Report
 from .observations import Observations
-from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
+from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise, steps_ahead
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 
@@ -93,6 +93,9 @@ def fit(
     whole = Problem.of(replace(config, atmosphere=air), data)
     _check_count(whole, samples)
     few = _few(whole)
+    if config.optimiser == "levenberg_marquardt":
+        for problem in (few, whole):
+            steps_ahead(len(problem.scalars))
     if begun is None:
         few.model.place(few.atmosphere_values(few.start))
         _check_units(few)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -183,7 +184,7 @@ class _Steps:
         self._solver = jaxopt.LevenbergMarquardt(
             residual, materialize_jac=True, solver="cholesky", jit=True, implicit_diff=False
         )
-        self._state_type = type(jax.eval_shape(self._solver.init_state, jnp.zeros(size)))
+        self._state_type = type(jax.eval_shape(self._solver.init_state, jax.ShapeDtypeStruct((size,), jnp.float64)))
 
     def _on_host(self, which: int, u: Any) -> np.ndarray:
         """Small residuals (0) or Jacobian (1); JAX would hide an error that passed through it."""
@@ -233,14 +234,39 @@ class _Steps:
         return u, state
 
 
-_steps_for = lru_cache(maxsize=16)(_Steps)
+class _Bowl:
+    """Half of the squared distance to the origin: what :class:`_Steps` is compiled on."""
+
+    def cost(self, u: np.ndarray) -> float:
+        return 0.5 * float(u @ u)
+
+    def small(self, u: np.ndarray, more: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.append(u, np.sqrt(2.0 * more)), np.vstack([np.eye(len(u)), np.zeros(len(u))])
+
+
+_aside = ThreadPoolExecutor(1, thread_name_prefix="atmo-jit-steps")
+
+
+@lru_cache(maxsize=16)
+def steps_ahead(size: int) -> Future[_Steps]:
+    """Steps for this many unknowns, compiled in a thread of its own: to import and compile them takes about as long as
+    the kernels of the first sky, which does not wait for them."""
+    return _aside.submit(_compiled, size)
+
+
+def _compiled(size: int) -> _Steps:
+    jax, _ = _jaxopt()
+    with jax.enable_x64(True):
+        steps, start = _Steps(size), np.ones(size)
+        steps(start, steps.start(_Bowl(), start))
+    return steps
 
 
 def _levenberg_marquardt(
     functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Progress
 ) -> Solution:
     """Steps of :class:`_Steps` until they gain nothing."""
-    steps, u = _steps_for(len(start)), start
+    steps, u = steps_ahead(len(start)).result(), start
     state = steps.start(functions, start)
     best = steps.best
 
