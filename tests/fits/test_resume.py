@@ -26,7 +26,7 @@ calibration = { sigma = 0.05 }
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A noisy scan of 300 directions, more than are looked at first, from a start so far off that others are tried."""
+    """A scan of 300 directions, more than are looked at first, and a start so far off that another is tried."""
     rng = np.random.default_rng(4)
     zenith, azimuth = rng.uniform(0.0, 80.0, 300), rng.uniform(15.0, 345.0, 300)
     views = {"altitude_m": 0.0 * zenith, "sun_zenith_deg": 0.0 * zenith + 50.0}
