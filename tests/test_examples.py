@@ -23,7 +23,7 @@ import pytest
 import atmo_jit
 from atmo_jit import scenes
 from atmo_jit.cli import group, main
-from bench.hostile import CONFIG
+from bench.hostile_targets import CONFIG
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
