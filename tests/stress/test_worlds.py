@@ -19,8 +19,8 @@ LIMITS = {"transmittance, twin": 1e-3, "sun irradiance, twin": 5e-4, "single sca
 
 
 # 38: air 205 m deep under a top 35,000 km up, which no ray was cut for. 161, 3031: the sun sets between two nodes of a
-# ray.
-@pytest.mark.parametrize("number", [38, 161, 3031])
+# ray. 184: the sun seen from 56 m under a step of density 56,000 km up.
+@pytest.mark.parametrize("number", [38, 161, 184, 3031])
 def test_light_is_that_of_the_twin(number):
     rng = Random(number)
     air = extreme_world(rng)
