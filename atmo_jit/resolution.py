@@ -78,7 +78,7 @@ class Resolution:
         particles scatter.
         """
         first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
-        later = min(_degree(atmosphere, 2, 3, 0.02 * tolerance), first)
+        later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
         if float(np.max(_depth(atmosphere))) > CLOUD:  # so many orders that no single one keeps its direction
             first, later = min(first, 16), min(later, 8)
         first = next(degree for degree in FIRST_DEGREES if degree >= first)
@@ -95,7 +95,8 @@ class Resolution:
             first_degree=first,
             # Two levels leave 3 % of the light that twilight brings to the ground of a small planet.
             beam_refine=(2, 3, 3, 3)[level],
-            phase_degree=max(16, first + 4),
+            # As many as the azimuths tell apart when what they see is projected on the first ones.
+            phase_degree=max(16, first + 8),
         )
 
 

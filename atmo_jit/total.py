@@ -18,6 +18,7 @@ from .refinement import Reference, Taps
 # Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
 # derivative of a quotient, which has a square below the line, must not leave single precision.
 DARK = 1e-16
+NORMAL = float(np.finfo(np.float32).tiny)
 FEW_LEFT = 0.01  # of order 1, and their ratio is steady
 
 
@@ -220,7 +221,8 @@ def _per_depth(optics: Optics, columns: SunColumns, grid: Grid) -> Any:
     """1 / scattering depth of the air above, table [K, channels]; 0 where there is none."""
     optics = optics.spread(grid.shape[0])
     above = optics.scattering_depths(columns.upward(grid.kept("altitudes", lambda: floats(grid.h))))
-    inverse = [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above]
+    # What is smaller than a normal number is none: its inverse would be infinite, and the light over it 0 times that.
+    inverse = [dr.select(d >= NORMAL, 1.0 / dr.select(d >= NORMAL, d, 1.0), 0.0) for d in above]
     return table_of(inverse, dr.arange(types().UInt, grid.shape[0]))
 
 

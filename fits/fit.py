@@ -23,8 +23,9 @@ from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
 from .forward import ROUGH
+from .kept import Point, Report
 from .observations import Observations
-from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
+from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise, steps_ahead
 from .problem import HUBER, Evaluation, Problem, without_darkness
 from .uncertainty import Uncertainty, uncertainty
 
@@ -34,7 +35,6 @@ FEW_FOLD = 8  # as many times the unknowns, whichever is most
 UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
-RESTARTS = 3
 ROUNDS = 12  # of loss and weights, each of
 FIRST_ITERATIONS = 10
 STEPS_FORESEEN = 3
@@ -67,12 +67,23 @@ class Fit:
         return dict(zip((s.name for s in self.problem.scalars), self.problem.values(self.u).tolist(), strict=True))
 
 
-def fit(data: Observations, config: FitConfig, progress: Progress | None = None) -> Fit:
+def fit(
+    data: Observations,
+    config: FitConfig,
+    progress: Progress | None = None,
+    keep: Callable[[Point], None] | None = None,
+    begun: Point | None = None,
+) -> Fit:
     """Fit the free values of ``config`` to ``data``. ``progress`` is called with an estimate of the fraction done.
 
-    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right.
+    ``keep`` is called with every point from which another call can go on when it has ``begun`` there. That comes to the
+    same minimum, to a part of the standard errors that ends a search (a tenth), since it does not know the Jacobians of
+    the steps before.
+
+    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right; for a
+    point of another fit.
     """
-    started = time.perf_counter()
+    started = time.perf_counter() - (begun.seconds if begun else 0.0)
     air = at_wavelengths(config.atmosphere, data.wavelengths_nm)
     before = np.count_nonzero(data.used)
     if config.residual == "log":
@@ -82,22 +93,24 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     whole = Problem.of(replace(config, atmosphere=air), data)
     _check_count(whole, samples)
     few = _few(whole)
-    few.model.place(few.atmosphere_values(few.start))
-    _check_units(few)
-    report = _Report(progress)
-    tries = []
-    for start in _starting_points(few):
-        tries.append(_minimum(few, start, report))
-        if tries[-1].solution.converged and not _poor(tries[-1]):
-            break
-        if len(tries) > RESTARTS:
-            break
-    # Poor ends are compared by their residuals, whose scale does not change with the loss.
-    best = min(tries, key=lambda end: _scale(end.left))
-    end = _polished(whole, whole.spread(few, best.solution.u), report)
+    if config.optimiser == "levenberg_marquardt":
+        for problem in (few, whole):
+            steps_ahead(len(problem.scalars))
+    if begun is None:
+        few.model.place(few.atmosphere_values(few.start))
+        _check_units(few)
+        begun = Point(0, (), tuple(few.start), tuple(few.start))
+    elif not _fits(begun, few, whole):
+        raise InputError("begun: is a point of another fit")
+    report = Report(progress, keep, begun, started)
+    if begun.step == 0:
+        _search(few, whole, report)
+    step = max(begun.step, 1)
+    end = _polished(whole, report)
     # Where the model errs more than the data, finer nodes show nothing.
-    if end.problem.excess == 1.0 and whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
-        end = _polished(whole, end.solution.u, report)
+    if step == 1 and end.problem.excess == 1.0 and whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
+        report.reached(step=2, nodes=end.solution.u, u=end.solution.u)
+        end = _polished(whole, report)
     problem, u, solution = end.problem, end.solution.u, end.solution
     found = replace(problem.evaluate(u), jacobian=solution.jacobian)
     errors = uncertainty(problem, u, found)
@@ -106,20 +119,15 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     if len(masked.radiance):
         unseen = masked, Problem(problem.config, masked, problem.model.at(masked), problem.leaves).evaluate(u).predicted
     seconds = time.perf_counter() - started
-    return Fit(problem, u, found, errors, solution, len(tries), seconds, int(before - samples), unseen)
+    starts = len(report.point.ends)
+    return Fit(problem, u, found, errors, solution, starts, seconds, int(before - samples), unseen)
 
 
-class _Report:
-    """Progress over all minimisations: every iteration takes a share of what is left."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self._progress, self._left, self.iterations = progress, 1.0, 0
-
-    def __call__(self, iteration: int, cost: float) -> None:
-        self.iterations += 1
-        self._left *= 0.9
-        if self._progress is not None:
-            self._progress(1.0 - self._left)
+def _fits(point: Point, few: Problem, whole: Problem) -> bool:
+    """Whether the numbers of unknowns are those of the problem."""
+    here = len(whole.scalars) if point.step else len(few.scalars)
+    counts = {len(point.nodes) - here, len(point.u) - here, *(len(end) - len(few.scalars) for end in point.ends)}
+    return counts == {0} and (len(point.ends) > 0 if point.step else len(point.ends) < len(_starting_points(few)))
 
 
 @dataclass(frozen=True)
@@ -135,13 +143,31 @@ class _End:
         return self.problem.evaluate(self.solution.u).raw[self.problem.data.used]
 
 
-def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
+def _search(few: Problem, whole: Problem, report: Report) -> None:
+    """The best minimum for some of the samples, from where the report's point is and, where that ends poorly, from
+    other starts; as the point from which all samples are looked at."""
+    few.model.place(few.atmosphere_values(np.array(report.point.nodes)))
+    ends = [np.array(end) for end in report.point.ends]
+    for start in [np.array(report.point.u), *_starting_points(few)[len(ends) + 1 :]]:
+        report.reached(ends=ends, u=start)
+        end = _minimum(few, start, report)
+        ends.append(end.solution.u)
+        if end.solution.converged and not _poor(end):
+            break
+    # Poor ends are compared by their residuals, whose scale does not change with the loss.
+    best = whole.spread(few, min(ends, key=lambda u: _scale(few.evaluate(u).raw[few.data.used])))
+    report.reached(step=1, ends=ends, nodes=best, u=best)
+
+
+def _minimum(few: Problem, start: np.ndarray, report: Report) -> _End:
     """The minimum for some of the samples from one start; with a loss and weights that suit what is left there."""
     u, known = start, None
     for _ in range(ROUNDS):
+        nodes = {}
         if few.model.strays(few.atmosphere_values(u)):
             few.model.place(few.atmosphere_values(u))
-            known = None
+            known, nodes = None, {"nodes": u}
+        report.reached(u=u, **nodes)
         problem = _weighed(few, u)
         solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS, known)
         u, known = solution.u, (solution.u, solution.jacobian)
@@ -151,10 +177,11 @@ def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
     return end
 
 
-def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
-    """The minimum for all samples, on nodes for the atmosphere at ``u``."""
-    whole.model.place(whole.atmosphere_values(u))
-    problem = _weighed(whole, u)
+def _polished(whole: Problem, report: Report) -> _End:
+    """The minimum for all samples, on nodes and with weights for the atmosphere that the report's point names."""
+    nodes, u = np.array(report.point.nodes), np.array(report.point.u)
+    whole.model.place(whole.atmosphere_values(nodes))
+    problem = _weighed(whole, nodes)
     last = _solve(problem, u, report, STEP_TOLERANCE)
     return _End(problem, replace(last, iterations=report.iterations))
 
@@ -181,7 +208,7 @@ def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def _solve(
     problem: Problem,
     u: np.ndarray,
-    report: _Report,
+    report: Report,
     enough: float,
     iterations: int = MAX_ITERATIONS,
     known: tuple[np.ndarray, np.ndarray] | None = None,
