@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -110,7 +111,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
 def write_exr(path: str | Path, picture: Picture, metadata: dict[str, str | float | int]) -> None:
     """Write a picture as float32 OpenEXR (ZIP), its colours linear with sRGB primaries.
 
-    metadata: further header attributes, text and numbers.
+    metadata: further header attributes, text and numbers. Raises OSError where the file cannot be written.
     """
     import OpenEXR
 
@@ -122,5 +123,15 @@ def write_exr(path: str | Path, picture: Picture, metadata: dict[str, str | floa
     }
     pixels = np.moveaxis(picture.pixels.astype(np.float32), -1, 0)
     channels = {name: np.ascontiguousarray(plane) for name, plane in zip(picture.channels, pixels, strict=True)}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
+    write_planes(path, header, channels)
+
+
+def write_planes(path: str | Path, header: dict[str, Any], planes: dict[str, np.ndarray]) -> None:
+    """Write channels as OpenEXR. Raises OSError where the file cannot be written, of which OpenEXR has another idea."""
+    import OpenEXR
+
+    with OpenEXR.File(header, planes) as file:
+        try:
+            file.write(str(path))
+        except RuntimeError as error:
+            raise OSError(str(error).rpartition('". ')[2].rstrip(".")) from None
