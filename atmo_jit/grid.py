@@ -81,12 +81,6 @@ class Grid(Keeper):
         self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine)
         self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
 
-    def arrays(self) -> list[Any]:
-        """Every Dr.Jit array that is kept, once."""
-        found: dict[int, Any] = {}
-        _collect(vars(self), found, set())
-        return list(found.values())
-
     def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
         # Samples dense near the ground, so that a thin layer there is resolved too.
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 2
@@ -197,6 +191,13 @@ class Grid(Keeper):
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
         """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
         return split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
+
+
+def arrays_in(*things: Any) -> list[Any]:
+    """Every Dr.Jit array within containers and objects of this package, once."""
+    found: dict[int, Any] = {}
+    _collect(things, found, set())
+    return list(found.values())
 
 
 def _collect(value: Any, found: dict[int, Any], seen: set[int]) -> None:

@@ -19,14 +19,14 @@ import drjit as dr
 import numpy as np
 
 from .. import mapping
-from ..backend import floats, packet, padded, parameter, types
+from ..backend import floats, packet, padded, parameter, stored, types
 from ..mapping import texels
 from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
 from .mean_source import MeanSource, Series, view_cosines
+from .node_light import NodeLight, Nodes, is_peaked
 from .sightlines import Sightlines
-from .sky_view import NodeLight, Nodes, is_peaked
 from .sunlight import Sunlight
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
@@ -123,7 +123,7 @@ class Tables4D:
         return NodeLight(
             smooth,
             dict(zip(kinds, peaks, strict=True)),
-            [dr.gather(t.Float, v, row) for v in through],
+            stored([dr.gather(t.Float, v, row) for v in through], dr.arange(t.UInt, rows), padded(len(through))),
         )
 
     @property
@@ -192,7 +192,7 @@ class _Band4D:
         if self.band.source is not None:
             whole = lines.scattering.reshape(len(h), rows, *lines.scattering.shape[1:])
             places = np.broadcast_to(x, (len(h), rows))
-            series = Series(MeanSource(self.band, mu_s).along(h, places, is_up, whole))
+            series = Series.of(MeanSource(self.band, mu_s).along(h, places, is_up, whole))
             smooth = series.at(ray * suns + sun, cos_phi)
         for n, k in enumerate(optics.scatterers):
             if n not in self.peaks:
