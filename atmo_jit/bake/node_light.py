@@ -173,6 +173,7 @@ class _Observer:
         ray = self._ray
         sun, across = mu_s + dr.zeros(t.Float, dr.width(ray)), sin_s * self._cos_phi
         nu = lines.nu(ray, sun, across)
+        dr.eval(sun, across, nu)
         smooth = [dr.zeros(t.Float, dr.width(ray)) for _ in range(optics.channel_count)]
         if self._ground:  # only rows below the horizon meet it; they are the last
             first = int(np.count_nonzero(self._nodes.up)) * self._nodes.shape[1]

@@ -191,14 +191,12 @@ class Sightlines:
         return at.rays.at(at.ray_of_piece, centre, t.Float64(0.0))[0], stored(weights, piece, size)
 
     def nu(self, ray: Any, mu_s: Any, across: Any) -> Any:
-        """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``, evaluated.
+        """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``.
 
         ``across`` = sin(sun zenith) cos(azimuth of the view from the sun), here and below.
         """
         _, _, sine, mu = packet(self._ends, ray, 4)
-        nu = dr.clip(dr.fma(mu, mu_s, sine * across), -1.0, 1.0)
-        dr.eval(ray, mu_s, across, nu)
-        return nu
+        return dr.clip(dr.fma(mu, mu_s, sine * across), -1.0, 1.0)
 
     def single(self, sunlight: Sunlight, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
         """Single scattering without phase functions, [scatterer][channel], evaluated."""
@@ -236,8 +234,8 @@ class Sightlines:
         return single
 
     def multiple(self, source: Any, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
-        """Radiance of all orders after the first by the scatterer that sent it here, [scatterer][channel], evaluated:
-        the field, asked once per stretch."""
+        """Radiance of all orders after the first by the scatterer that sent it here, [scatterer][channel]: the field,
+        asked once per stretch. Not evaluated, so that what is made of it is part of the same kernel."""
         t = types()
         kinds, channels = len(self.optics.scatterers), self.optics.channel_count
         size = padded(channels)
@@ -257,7 +255,6 @@ class Sightlines:
         sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
         start, end = (dr.gather(t.UInt, first, ray + o) for o in (0, 1))
         _, sums = dr.while_loop((start, sums), lambda i, _: i < end, stretch, label="sightlines: multiple")
-        dr.eval(sums)
         return [sums[n * channels : (n + 1) * channels] for n in range(kinds)]
 
     def ground_light(self, columns: SunColumns, field: Field, ray: Any, mu_s: Any, across: Any) -> list[Any]:
