@@ -8,9 +8,9 @@ so that N(h, -mu) = 2 N(h_p, 0) - N(h, mu). What is stored is the mean density a
 finite and smooth up to the top, where both vanish, and constant in mu for a flat layer.
 
 Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends.
-Just below a kink a horizontal ray's column has a root, sqrt(h_break - h): rows lie at h_break - width x^2, and
-profiles with kinks are interpolated linearly in x, which is exact for the root. Exponential profiles have no kinks;
-the logarithm of their mean is interpolated linearly in h.
+Just below a kink a horizontal ray's column has a root, sqrt(h_break - h), and an oblique one's a line: rows lie at
+h_break - width x^2, and profiles with kinks are interpolated linearly in the distance to the break, which is exact for
+both. Exponential profiles have no kinks; the logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ class SunColumns:
         place, column = lane // cosines % rows, lane % cosines
         low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
         x = t.Float(place) / self._rows
-        # Each end belongs to this shell's side of the break.
-        h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
+        h = dr.maximum(dr.fma(low - high, x * x, high), low)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
         totals = column_up(self.optics, h, mu, self._rule)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
-        at_top = self.optics.densities(h)  # where the path has no length
+        # Where the path has no length: that on this shell's side of the break.
+        at_top = self.optics.densities(dr.fma(low - high, dr.maximum(x, 1e-3) ** 2, high))
         means = []
         for k, total in enumerate(totals):
             mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
@@ -118,7 +118,6 @@ class SunColumns:
         y = dr.safe_sqrt(depth) * self._rows
         below = dr.minimum(t.UInt(y), self._rows - 1)
         start = t.Float(below)
-        by_root = y - start
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
         corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
         if mu is None:
@@ -132,10 +131,21 @@ class SunColumns:
             )
             near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
         path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)
+        if not all(self._logarithmic):
+            # x under the break is sqrt(bend + x^2) - sqrt(bend) away from it, in units of a horizontal ray's first row.
+            r = self.optics.radius + high
+            bend = 0.0 if mu is None else mu * mu * r * (0.5 * self._rows**2) * per_width
+            here, nearer, farther = (dr.sqrt(dr.fma(x, x, bend)) for x in (y, start, start + 1.0))
+            by_distance = by_altitude * ((farther + nearer) / dr.maximum(here + nearer, 1e-30))
+            unit = dr.sqrt(2.0 * r / per_width) / self._rows
+            # Columns, not means, are linear: the paths to the top of the rows.
+            nearer, farther = (dr.maximum(dr.fma(unit, x - here, path), 0.0) for x in (nearer, farther))
         result = []
         for k in range(n):
-            mean = dr.lerp(near[k], far[k], by_altitude if self._logarithmic[k] else by_root)
-            result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
+            if self._logarithmic[k]:
+                result.append(dr.exp(dr.lerp(near[k], far[k], by_altitude)) * path)
+            else:
+                result.append(dr.lerp(near[k] * nearer, far[k] * farther, by_distance))
         return result
 
 

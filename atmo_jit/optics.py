@@ -260,10 +260,11 @@ class Optics:
                 kinks.update(_ramp_levels(c.profile, extinction, radius))
         levels += kinks
         levels = np.unique(np.clip(levels, 0.0, top))
-        # A scale-height level beside another break only costs time; kinks stay.
+        # A scale-height level beside another break only costs time; kinks stay. How near is near depends on the level
+        # alone: under a top a hundred thousand scale heights up the air at the ground is as steep as under a low one.
         kept = [0.0]
         for level in levels[1:]:
-            if level in kinks or level - kept[-1] > 0.25 * kept[-1] + 1e-4 * top:
+            if level in kinks or level > 1.25 * kept[-1]:
                 kept.append(float(level))
         if kept[-1] != top:
             kept.append(top)

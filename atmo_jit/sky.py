@@ -282,8 +282,7 @@ class Sky:
             dr.select(outside, (r * mu_s + gap * nu) / r_in, mu_s),
             nu,
         )
-        h = t.Float(dr.minimum(altitude, top))
-        rays = rays_to_boundary(optics, h, *(t.Float(dr.clip(v, -1.0, 1.0)) for v in cosines))
+        rays = rays_to_boundary(optics, dr.minimum(altitude, top), *(dr.clip(v, -1.0, 1.0) for v in cosines))
         meets_air = t.Bool(meets)
         rays.stop = dr.select(meets_air, rays.stop, 0.0)
         rays.ground &= meets_air

@@ -9,7 +9,6 @@ from it. Afterwards every command runs once undisturbed, after which nothing tem
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -28,9 +27,9 @@ import numpy as np
 
 from atmo_jit.export.containers import read_exr
 from atmo_jit.files import read_npz
-from atmo_jit.progress import progress_bar
 
-from .hostile import CONFIG
+from .counted import main
+from .hostile_targets import CONFIG
 
 OLD = b"old"
 WAYS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, "full disk")
@@ -165,7 +164,7 @@ def kill(
                     process.send_signal(way)
             _, text = process.communicate()
             label = way if full else way.name
-            found[work.name, label, process.returncode] += 1
+            found[work.name, label, f"status {process.returncode}"] += 1
             what = f"{work.name}, {label}, {seed}:{number}: "
             wrong += [what + line for line in work.broken()]
             old = any((work.folder / n).read_bytes() == OLD for n in work.outputs)
@@ -199,20 +198,5 @@ def _resumed(work: Work) -> list[str]:
     return work.broken()
 
 
-def main() -> int:
-    """Stop them and print what came of it."""
-    parser = argparse.ArgumentParser(prog="python -m bench.kills", description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=50, help="default: %(default)s")
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
-    options = parser.parse_args()
-    with progress_bar("kills") as advance:
-        found, wrong = kill(options.count, options.seed, advance=advance)
-    for (name, way, status), count in sorted(found.items(), key=str):
-        print(f"{name}: {way}: {status if status == 'kept' else f'status {status}'}: {count}")
-    print("\n".join(wrong))
-    print(f"{options.count} kills, {len(wrong)} wrong")
-    return int(bool(wrong))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main("bench.kills", __doc__, "kills", 50, lambda count, seed, advance: kill(count, seed, advance=advance)))

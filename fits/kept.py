@@ -131,7 +131,7 @@ class KeptFit:
         """Have ``point`` in the file in a while, or when the work ends early."""
         self._point = point
         if time.perf_counter() - self._written > KEEP_SECONDS:
-            self._write(point)
+            self.write()
 
     @contextmanager
     def until_done(self, warn: Callable[[str], None]) -> Iterator[None]:
@@ -141,13 +141,14 @@ class KeptFit:
         except BaseException as error:  # an interrupt may come out of a library as something else
             if self._point and not isinstance(error, InputError):
                 with suppress(OSError):  # a full disk, perhaps what ended the block
-                    self._write(self._point)
+                    self.write()
                     warn(f"{self.path.name} holds the fit after {self._point.iterations} iterations; --resume goes on")
             raise
         self.path.unlink(missing_ok=True)
 
-    def _write(self, point: Point) -> None:
-        document = {"settings": self._settings, "point": asdict(point)}
+    def write(self) -> None:
+        """Have the last point in the file now."""
+        document = {"settings": self._settings, "point": asdict(self._point)}
         with atomic_outputs(self.path) as (part,):
             part.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         self._written = time.perf_counter()

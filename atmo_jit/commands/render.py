@@ -23,6 +23,10 @@ from atmo_jit.partial import KEEP_SECONDS
 from atmo_jit.passes import PASS_SAMPLES, REFERENCE_PASS_SAMPLES, Passes
 from atmo_jit.progress import progress_bar
 
+# Warnings of Mitsuba that this command has its own word for: interrupts, and NaN (colours outside of sRGB, which have
+# negative values, are none of its business).
+OTHERWISE_SAID = ("interrupt signal", "[ImageBlock] Invalid sample value")
+
 
 @click.command()
 @click.argument("scene", required=False)
@@ -108,8 +112,9 @@ def command(
                 kept.write(parts[-1], passes, extra["renderSeconds"])
         return picture
 
-    with _mitsuba(variant):
+    with _mitsuba(variant) as warnings:
         loaded, contents = _load(path, parameters, width, height, reference)
+        warnings.say()
         most = REFERENCE_PASS_SAMPLES if reference else PASS_SAMPLES
         passes = Passes(loaded, spp, most, scatter=standard_error)
         if kept:
@@ -183,8 +188,10 @@ def _parameters(definitions: tuple[str, ...]) -> dict[str, str]:
 
 
 @contextmanager
-def _mitsuba(variant: str) -> Iterator[None]:
-    """Mitsuba with a variant set, this package's plugins registered and its log turned into warnings on stderr.
+def _mitsuba(variant: str) -> Iterator[Any]:
+    """Mitsuba with a variant set, this package's plugins registered and its log turned into warnings on stderr: those
+    that come while the scene is loaded once ``say`` of what it gives is called, or at the end. Where input is refused,
+    that is all that is said.
 
     Raises InputError when the variant is not in this build of Mitsuba or its backend does not start.
     """
@@ -206,14 +213,23 @@ def _mitsuba(variant: str) -> Iterator[None]:
 
         def __init__(self) -> None:
             super().__init__()
-            self.seen: set[str] = set()
+            self.seen: dict[str, bool] = {}  # and said
+            self.saying = False
 
         def append(self, level: Any, text: str) -> None:
             text = one_line(re.sub(r"^\S+ \S+ WARN\s+", "", text))
-            # Ctrl-C is announced as a warning too; the command line has its own word for that.
-            if text not in self.seen and "interrupt signal" not in text:
-                self.seen.add(text)
-                _warn(text)
+            if text not in self.seen and not any(other in text for other in OTHERWISE_SAID):
+                self.seen[text] = False
+                if self.saying:
+                    self.say()
+
+        def say(self) -> None:
+            """Say what was held back, and from now on all at once."""
+            self.saying = True
+            for text, said in list(self.seen.items()):  # Mitsuba's threads may add to it
+                if not said:
+                    self.seen[text] = True
+                    _warn(text)
 
         def log_progress(self, *args: Any) -> None:
             """Mitsuba's own progress: this command has its bar."""
@@ -222,13 +238,15 @@ def _mitsuba(variant: str) -> Iterator[None]:
     level = logger.log_level()
     former = [logger.appender(index) for index in range(logger.appender_count())]
     logger.clear_appenders()
-    logger.add_appender(Warnings())
+    warnings = Warnings()
+    logger.add_appender(warnings)
     logger.set_log_level(mi.LogLevel.Warn)
     try:
         from atmo_jit.plugins import register
 
         register()
-        yield
+        yield warnings
+        warnings.say()
     finally:
         logger.clear_appenders()
         for appender in former:

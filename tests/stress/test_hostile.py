@@ -11,7 +11,9 @@ from random import Random
 import numpy as np
 import pytest
 
-from bench.hostile import _hostile_npz, _npz, damaged, feed, targets
+from bench.damage import damaged, hostile_npz, npz
+from bench.hostile import feed
+from bench.hostile_targets import targets
 
 LIMITED = """
 import resource, sys
@@ -34,13 +36,13 @@ def test_many_of_the_files():
 def test_a_good_file_is_damaged(tmp_path):
     """The fuzzer does what it says: few of its files are still good."""
     for target in targets(tmp_path):
-        bad = {damaged(Random(i), target, tmp_path / "mark") for i in range(30)}
+        bad = {damaged(Random(i), target.name, target.content, str(tmp_path / "mark")) for i in range(30)}
         assert len(bad - {target.content}) > 15
 
 
 def test_a_bomb_takes_no_memory(tmp_path):
     """A packed array of 4 GiB, of which half a GiB is there, and another bad file, in a process that may have 3 GiB."""
-    good = _npz({name: np.zeros(6) for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")})
+    good = npz({name: np.zeros(6) for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")})
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("altitude_m.npy", "w", force_zip64=True) as member:
@@ -49,7 +51,7 @@ def test_a_bomb_takes_no_memory(tmp_path):
             )
             for _ in range(1 << 5):
                 member.write(b"\0" * (1 << 24))
-    for i, content in enumerate([stream.getvalue(), _hostile_npz(Random(0), good, tmp_path / "mark")]):
+    for i, content in enumerate([stream.getvalue(), hostile_npz(Random(0), good, str(tmp_path / "mark"))]):
         (tmp_path / f"{i}.npz").write_bytes(content)
         done = subprocess.run(
             [sys.executable, "-c", LIMITED, "sky", "--atmosphere", "earth", "--views", f"{i}.npz", "--out", "o.npz"],
