@@ -166,7 +166,7 @@ class MeanSourceHere:
         lane = dr.arange(t.UInt, self.count * azimuths)
         across = sin_s * dr.gather(t.Float, self._cosines, lane % azimuths)
         ray, sun = lane // azimuths, mu_s + dr.zeros(t.Float, dr.width(lane))
-        table = lines.scattering_table()
+        table = lines.scattering_table
         light = lines.multiple(source, ray, sun, across, lines.nu(ray, sun, across))
         light = [v for kind in light for v in (*kind, *[t.Float(0.0)] * (size - channels))]
         whole = packet(table, ray, kinds * size)

@@ -183,7 +183,7 @@ class _Observer:
                 dr.scatter(v, glow, below)
             dr.eval(smooth)
         if other is not None:
-            series = self._here.along(other.of(optics, None), field, mu_s, sin_s, lines.scattering_table())
+            series = self._here.along(other.of(optics, None), field, mu_s, sin_s, lines.scattering_table)
             smooth = [v + m for v, m in zip(smooth, series.at(ray, self._cos_phi), strict=True)]
         peaks, singles = {}, []
         if optics.scatterers:

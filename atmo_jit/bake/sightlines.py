@@ -85,7 +85,7 @@ class Sightlines:
     def _anew(self) -> Sightlines:
         """These without what follows from values and nodes."""
         other = copy(self)
-        for kept in ("_weights", "_by_node", "_stretches"):
+        for kept in ("_weights", "_by_node", "_stretches", "scattering_table"):
             vars(other).pop(kept, None)
         return other
 
@@ -123,6 +123,7 @@ class Sightlines:
         """Integral of scattering coefficient times transmittance along the rays [R, K, C], for every scatterer."""
         return sums(self._by_node.sum(axis=1, dtype=np.float64), self.at.first)
 
+    @cached_property
     def scattering_table(self) -> Any:
         """``scattering`` by a kernel, for the values at hand: [ray, scatterer, padded channel]."""
         t, size, weights = types(), self._row, self._weights
@@ -175,7 +176,7 @@ class Sightlines:
             return t.Float(), t.Float()
         wide = size // max(kinds, 1)
         piece = dr.arange(t.UInt, len(at.ray))
-        whole = packet(self.scattering_table(), at.ray_of_piece, size)
+        whole = packet(self.scattering_table, at.ray_of_piece, size)
         # A channel's share counts as much as another's.
         inverse = [dr.rcp(dr.maximum(sum(whole[c::wide]), 1e-30)) for c in range(self.optics.channel_count)]
         total, moment, weights = t.Float64(0.0), t.Float64(0.0), [t.Float(0.0)] * size
@@ -279,5 +280,6 @@ def in_steps(values: np.ndarray, *, up: bool) -> np.ndarray:
 
 def padded_channels(values: np.ndarray) -> Any:
     """[..., channels] as a buffer with channels padded for packet loads."""
-    extra = padded(values.shape[-1]) - values.shape[-1]
-    return floats(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, extra)]))
+    wide = np.zeros((*values.shape[:-1], padded(values.shape[-1])), dtype=np.float32)
+    wide[..., : values.shape[-1]] = values
+    return floats(wide)
