@@ -14,6 +14,7 @@ import numpy as np
 from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
+MOST_ALTITUDES = 48
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 REMEMBERED = 64  # phase functions whose moments are kept
@@ -61,7 +62,7 @@ class Resolution:
     beam_refine: int = 2
     beam_azimuths: int = 4
     beam_nodes: int = 2
-    orders: int = 40
+    orders: int = 100
     converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
 
@@ -79,15 +80,18 @@ class Resolution:
         """
         first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
         later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
-        if float(np.max(_depth(atmosphere))) > CLOUD:  # so many orders that no single one keeps its direction
+        # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
+        thick = float(np.max(_depth(atmosphere))) > CLOUD
+        if thick:
             first, later = min(first, 16), min(later, 8)
         first = next(degree for degree in FIRST_DEGREES if degree >= first)
         stages = [_stage(later), _stage((3 * later) // 4)]
         level = int(np.searchsorted(-np.array(FINER), -tolerance))
         return cls(
-            altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level]),
+            altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level], 16.0 if thick else 8.0),
             suns=(21, 25, 29, 33)[level],
             first_suns=(1, 2, 2, 2)[level],
+            nodes=4 if thick else 2,
             stages=tuple(stages if stages[0] != stages[1] else stages[:1]),
             first_up=max(10, first),
             first_down=max(8, first - 2),
@@ -142,12 +146,12 @@ def moments_of(phase: Any, degree: int) -> np.ndarray:
 _moments: dict[Any, np.ndarray] = {}
 
 
-def _altitudes(atmosphere: Atmosphere, clear: int) -> int:
+def _altitudes(atmosphere: Atmosphere, clear: int, per_doubling: float) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
     depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
     scattering = sum(depths, start=np.zeros(1))
-    extra = 8.0 * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
-    return min(clear + 4 * int(np.ceil(extra / 4.0)), 40)
+    extra = per_doubling * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
+    return min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
 
 
 def _depth(atmosphere: Atmosphere) -> np.ndarray:
