@@ -99,15 +99,15 @@ class SunColumns:
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
-        whole = self._rising(lowest, None, sinks)
+        whole = self._rising(lowest, 0.0, sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
     def upward(self, h: Any) -> list[Any]:
         """Column density (m) of every constituent straight up from altitude ``h``."""
-        return self._rising(h, types().Float(1.0), True) if self._count else []
+        return self._rising(h, 1.0, True) if self._count else []
 
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
-        """Columns to the top from ``h`` along mu >= 0; None: horizontally."""
+        """Columns to the top from ``h`` along mu >= 0; a number for it is 0.0 or 1.0, an edge of the table."""
         t = types()
         cosines = self._cosines
         position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
@@ -120,7 +120,8 @@ class SunColumns:
         start = t.Float(below)
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
         corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
-        if mu is None:
+        if isinstance(mu, float):
+            corner += 0 if mu == 0.0 else cosines - 1
             near, far = (row(self.table, corner + offset, n, active=active) for offset in (0, cosines))
         else:
             x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
@@ -130,11 +131,11 @@ class SunColumns:
                 row(self.table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
             )
             near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
-        path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)
+        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         if not all(self._logarithmic):
             # x under the break is sqrt(bend + x^2) - sqrt(bend) away from it, in units of a horizontal ray's first row.
             r = self.optics.radius + high
-            bend = 0.0 if mu is None else mu * mu * r * (0.5 * self._rows**2) * per_width
+            bend = mu * mu * r * (0.5 * self._rows**2) * per_width
             here, nearer, farther = (dr.sqrt(dr.fma(x, x, bend)) for x in (y, start, start + 1.0))
             above, beneath = dr.maximum(here + nearer, 1e-30), here + farther
             by_distance = by_altitude * ((farther + nearer) / above)

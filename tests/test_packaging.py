@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -34,6 +38,28 @@ def test_every_data_file_is_installed():
         folder = folder_of(package)
         kept = {file for pattern in settings["package-data"].get(package, ()) for file in folder.glob(pattern)}
         assert {file for file in files_below(folder) if file.parent == folder and file.suffix != ".py"} == kept
+
+
+IMPORT = """
+import importlib, sys
+import atmo_jit
+if sys.argv[1:]:
+    import mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+"""
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_imports_warn_of_nothing(everything):
+    """The package alone, as its users import it, and every module."""
+    packages = PROJECT["tool"]["setuptools"]["packages"] if everything else []
+    modules = [f"{name}.{file.stem}" for name in packages for file in sorted(folder_of(name).glob("*.py"))]
+    modules = [name.removesuffix(".__init__") for name in modules if not name.endswith("__main__")]
+    assert not everything or len(modules) > 100
+    done = subprocess.run([sys.executable, "-W", "error", "-c", IMPORT, *modules], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_the_readme_starts_with_two_complete_commands():

@@ -143,11 +143,14 @@ class _Band:
         ray = dr.arange(t.UInt, views * slices)
         sun, beside = floats(np.full(views * slices, mu_s)), floats(np.tile(across, slices))
         nu = lines.nu(ray, sun, beside)
+        dr.eval(ray, sun, beside, nu)
         shape = (slices, views)
         single = lines.single(Sunlight(optics, band.columns), ray, sun, beside, nu)
         smooth = np.zeros((*shape, self.channels))
         if band.source is not None:
-            for light in lines.multiple(band.source, ray, sun, beside, nu):
+            multiple = lines.multiple(band.source, ray, sun, beside, nu)
+            dr.eval(multiple)
+            for light in multiple:
                 smooth = smooth + _channels_last(light, shape)
         self.peaks, groups = [], []
         for k, light in zip(optics.scatterers, single, strict=True):

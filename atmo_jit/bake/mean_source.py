@@ -49,6 +49,7 @@ class MeanSource:
         across = sin_s * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), lane % azimuths)
         ray = rest // suns
         light = lines.multiple(band.source, ray, sun, across, lines.nu(ray, sun, across))
+        dr.eval(light)
         values = np.stack([np.stack([c.numpy() for c in kind], axis=-1) for kind in light], axis=-2)
         values = values.reshape(len(h), len(x), suns, azimuths, *values.shape[1:])
         whole = lines.scattering.reshape(len(h), len(x), 1, 1, *values.shape[4:])
@@ -162,36 +163,28 @@ class MeanSourceHere:
         t, optics, azimuths = types(), lines.optics, self.azimuths
         channels, kinds = optics.channel_count, len(optics.scatterers)
         size = padded(channels)
-        none = [t.Float(0.0)] * (size - channels)
         lane = dr.arange(t.UInt, self.count * azimuths)
         across = sin_s * dr.gather(t.Float, self._cosines, lane % azimuths)
         ray, sun = lane // azimuths, mu_s + dr.zeros(t.Float, dr.width(lane))
+        table = lines.scattering_table
         light = lines.multiple(source, ray, sun, across, lines.nu(ray, sun, across))
-        values = stored([v for kind in light for v in (*kind, *none)], lane, kinds * size)
-        order, whole = lane % azimuths, packet(lines.scattering_table(), lane // azimuths, kinds * size)
-
-        def azimuth(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            weight = dr.gather(t.Float, self._series, dr.fma(order, azimuths, j))
-            here = packet(values, lane - order + j, kinds * size)
-            return j + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
-
-        sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * size)]
-        most = dr.opaque(t.UInt, azimuths, 1)
-        _, sums = dr.while_loop((t.UInt(0), sums), lambda j, _: j < most, azimuth, label="mean source: series")
-        mean = [dr.select(w > 0.0, v / dr.select(w > 0.0, w, 1.0), 0.0) for v, w in zip(sums, whole, strict=True)]
+        light = [v for kind in light for v in (*kind, *[t.Float(0.0)] * (size - channels))]
+        whole = packet(table, ray, kinds * size)
+        mean = [dr.select(w > 0.0, v / dr.select(w > 0.0, w, 1.0), 0.0) for v, w in zip(light, whole, strict=True)]
         mean = stored(mean, lane, kinds * size)
         lane = dr.arange(t.UInt, dr.width(self._start) * azimuths)
         ray, order = lane // azimuths, lane % azimuths
-        end = dr.gather(t.UInt, self._end, ray)
+        start, end = (dr.gather(t.UInt, which, ray) for which in (self._start, self._end))
 
-        def node(v: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            weight = dr.gather(t.Float, self._matrix, dr.fma(ray, self.count, v))
-            here = packet(mean, dr.fma(v, azimuths, order), kinds * size)
-            return v + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
+        def sample(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            node = i // azimuths
+            weight = dr.gather(t.Float, self._matrix, dr.fma(ray, self.count, node))
+            weight *= dr.gather(t.Float, self._series, dr.fma(order, azimuths, i - node * azimuths))
+            here = packet(mean, i, kinds * size)
+            return i + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
 
-        sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * size)]
-        start = dr.gather(t.UInt, self._start, ray)
-        _, sums = dr.while_loop((start, sums), lambda v, _: v < end, node, label="mean source: along")
+        sums, end = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * size)], end * azimuths
+        _, sums = dr.while_loop((start * azimuths, sums), lambda i, _: i < end, sample, label="mean source: along")
         whole = packet(scattering, ray, kinds * size)
         series = [sum(sums[n * size + c] * whole[n * size + c] for n in range(kinds)) for c in range(size)]
         return Series(stored(series, lane, size), azimuths, channels)

@@ -173,6 +173,7 @@ class _Observer:
         ray = self._ray
         sun, across = mu_s + dr.zeros(t.Float, dr.width(ray)), sin_s * self._cos_phi
         nu = lines.nu(ray, sun, across)
+        dr.eval(sun, across, nu)
         smooth = [dr.zeros(t.Float, dr.width(ray)) for _ in range(optics.channel_count)]
         if self._ground:  # only rows below the horizon meet it; they are the last
             first = int(np.count_nonzero(self._nodes.up)) * self._nodes.shape[1]
@@ -182,7 +183,7 @@ class _Observer:
                 dr.scatter(v, glow, below)
             dr.eval(smooth)
         if other is not None:
-            series = self._here.along(other.of(optics, None), field, mu_s, sin_s, lines.scattering_table())
+            series = self._here.along(other.of(optics, None), field, mu_s, sin_s, lines.scattering_table)
             smooth = [v + m for v, m in zip(smooth, series.at(ray, self._cos_phi), strict=True)]
         peaks, singles = {}, []
         if optics.scatterers:

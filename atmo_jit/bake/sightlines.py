@@ -85,7 +85,7 @@ class Sightlines:
     def _anew(self) -> Sightlines:
         """These without what follows from values and nodes."""
         other = copy(self)
-        for kept in ("_weights", "_by_node", "_stretches"):
+        for kept in ("_weights", "_by_node", "_stretches", "scattering_table"):
             vars(other).pop(kept, None)
         return other
 
@@ -123,6 +123,7 @@ class Sightlines:
         """Integral of scattering coefficient times transmittance along the rays [R, K, C], for every scatterer."""
         return sums(self._by_node.sum(axis=1, dtype=np.float64), self.at.first)
 
+    @cached_property
     def scattering_table(self) -> Any:
         """``scattering`` by a kernel, for the values at hand: [ray, scatterer, padded channel]."""
         t, size, weights = types(), self._row, self._weights
@@ -175,7 +176,7 @@ class Sightlines:
             return t.Float(), t.Float()
         wide = size // max(kinds, 1)
         piece = dr.arange(t.UInt, len(at.ray))
-        whole = packet(self.scattering_table(), at.ray_of_piece, size)
+        whole = packet(self.scattering_table, at.ray_of_piece, size)
         # A channel's share counts as much as another's.
         inverse = [dr.rcp(dr.maximum(sum(whole[c::wide]), 1e-30)) for c in range(self.optics.channel_count)]
         total, moment, weights = t.Float64(0.0), t.Float64(0.0), [t.Float(0.0)] * size
@@ -191,14 +192,12 @@ class Sightlines:
         return at.rays.at(at.ray_of_piece, centre, t.Float64(0.0))[0], stored(weights, piece, size)
 
     def nu(self, ray: Any, mu_s: Any, across: Any) -> Any:
-        """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``, evaluated.
+        """Cosine of the angle between the rays ``ray`` (UInt indices) and suns at zenith cosine ``mu_s``.
 
         ``across`` = sin(sun zenith) cos(azimuth of the view from the sun), here and below.
         """
         _, _, sine, mu = packet(self._ends, ray, 4)
-        nu = dr.clip(dr.fma(mu, mu_s, sine * across), -1.0, 1.0)
-        dr.eval(ray, mu_s, across, nu)
-        return nu
+        return dr.clip(dr.fma(mu, mu_s, sine * across), -1.0, 1.0)
 
     def single(self, sunlight: Sunlight, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
         """Single scattering without phase functions, [scatterer][channel], evaluated."""
@@ -236,8 +235,8 @@ class Sightlines:
         return single
 
     def multiple(self, source: Any, ray: Any, mu_s: Any, across: Any, nu: Any) -> list[list[Any]]:
-        """Radiance of all orders after the first by the scatterer that sent it here, [scatterer][channel], evaluated:
-        the field, asked once per stretch."""
+        """Radiance of all orders after the first by the scatterer that sent it here, [scatterer][channel]: the field,
+        asked once per stretch. Not evaluated, so that what is made of it is part of the same kernel."""
         t = types()
         kinds, channels = len(self.optics.scatterers), self.optics.channel_count
         size = padded(channels)
@@ -257,7 +256,6 @@ class Sightlines:
         sums = [dr.zeros(t.Float, dr.width(ray)) for _ in range(kinds * channels)]
         start, end = (dr.gather(t.UInt, first, ray + o) for o in (0, 1))
         _, sums = dr.while_loop((start, sums), lambda i, _: i < end, stretch, label="sightlines: multiple")
-        dr.eval(sums)
         return [sums[n * channels : (n + 1) * channels] for n in range(kinds)]
 
     def ground_light(self, columns: SunColumns, field: Field, ray: Any, mu_s: Any, across: Any) -> list[Any]:
@@ -282,5 +280,6 @@ def in_steps(values: np.ndarray, *, up: bool) -> np.ndarray:
 
 def padded_channels(values: np.ndarray) -> Any:
     """[..., channels] as a buffer with channels padded for packet loads."""
-    extra = padded(values.shape[-1]) - values.shape[-1]
-    return floats(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, extra)]))
+    wide = np.zeros((*values.shape[:-1], padded(values.shape[-1])), dtype=np.float32)
+    wide[..., : values.shape[-1]] = values
+    return floats(wide)

@@ -187,6 +187,7 @@ class _Band4D:
         cos_phi = 1.0 - 2.0 * t.Float(phi) / (azimuths - 1.0)
         across = dr.sqrt((1.0 - cosine) * (1.0 + cosine)) * cos_phi
         nu = lines.nu(ray, cosine, across)
+        dr.eval(ray, cosine, across, nu)
         single = lines.single(Sunlight(optics, self.band.columns), ray, cosine, across, nu)
         smooth = [dr.zeros(t.Float, dr.width(lane)) for _ in range(self.channels)]
         if self.band.source is not None:
