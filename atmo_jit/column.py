@@ -137,10 +137,12 @@ class SunColumns:
             r = self.optics.radius + high
             bend = mu * mu * r * (0.5 * self._rows**2) * per_width
             here, nearer, farther = (dr.sqrt(dr.fma(x, x, bend)) for x in (y, start, start + 1.0))
-            by_distance = by_altitude * ((farther + nearer) / dr.maximum(here + nearer, 1e-30))
-            unit = dr.sqrt(2.0 * r / per_width) / self._rows
-            # Columns, not means, are linear: the paths to the top of the rows.
-            nearer, farther = (dr.maximum(dr.fma(unit, x - here, path), 0.0) for x in (nearer, farther))
+            above, beneath = dr.maximum(here + nearer, 1e-30), here + farther
+            by_distance = by_altitude * ((farther + nearer) / above)
+            # Columns, not means, are linear: the paths to the top of the rows. Roots are large beside their difference.
+            step = dr.sqrt(2.0 * r / per_width) * (dr.fma(2.0, start, 1.0) / self._rows)
+            nearer = dr.maximum(dr.fma(-step, by_altitude / above, path), 0.0)
+            farther = dr.fma(step, (1.0 - by_altitude) / beneath, path)
         result = []
         for k in range(n):
             if self._logarithmic[k]:
