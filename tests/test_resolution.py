@@ -30,6 +30,15 @@ def test_fog_needs_more_altitudes_and_accuracy_costs():
     assert suited(tolerance=0.001).first_degree > suited().first_degree
 
 
+def test_fine_solves_have_all_degrees_in_all_orders():
+    for changes in ({}, {"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.85}):
+        air = EARTH.replace(changes)
+        usual, fine = (Resolution.suited(air, 0.01, fine=fine) for fine in (False, True))
+        assert [stage.degree for stage in fine.stages] == [fine.first_degree]
+        assert fine.first_degree > usual.first_degree and fine.altitudes > usual.altitudes
+        assert fine.stages[0].most == usual.stages[0].most
+
+
 def test_as_many_moments_as_are_asked_for():
     few, many = (moments_of(HenyeyGreenstein(0.83), degree) for degree in (10, 60))
     assert len(few) == 11 and many == pytest.approx(0.83 ** np.arange(61))
