@@ -15,7 +15,8 @@ from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
 MOST_ALTITUDES = 48
-FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+# Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
+FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 FINE_DEGREES, FINE_ALTITUDES = 4, 4  # more for derivatives that are to be as exact as the light
 REMEMBERED = 64  # phase functions whose moments are kept
