@@ -16,7 +16,7 @@ from importlib import import_module
 import click
 
 from . import __version__
-from .errors import InputError, LLVMError, one_line
+from .errors import InputError, LLVMError, OutputError, one_line
 from .interrupts import interrupted_by_signals
 from .llvm import missing_library
 
@@ -83,7 +83,7 @@ def _failed(error: Exception, settings: _Settings) -> int:
         return 1
     if isinstance(error, click.ClickException):
         return _fail(error.format_message(), 2, settings)
-    if isinstance(error, InputError | LLVMError):
+    if isinstance(error, InputError | LLVMError | OutputError):
         return _fail(str(error), 2 if isinstance(error, InputError) else 1, settings)
     text = missing_library(error) or f"{type(error).__name__}: {error} (atmo-jit --debug shows where)"
     return _fail(text, 1, settings)

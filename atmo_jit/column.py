@@ -8,9 +8,9 @@ so that N(h, -mu) = 2 N(h_p, 0) - N(h, mu). What is stored is the mean density a
 finite and smooth up to the top, where both vanish, and constant in mu for a flat layer.
 
 Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends.
-Just below a kink a horizontal ray's column has a root, sqrt(h_break - h): rows lie at h_break - width x^2, and
-profiles with kinks are interpolated linearly in x, which is exact for the root. Exponential profiles have no kinks;
-the logarithm of their mean is interpolated linearly in h.
+Just below a kink a horizontal ray's column has a root, sqrt(h_break - h), and an oblique one's a line: rows lie at
+h_break - width x^2, and profiles with kinks are interpolated linearly in the distance to the break, which is exact for
+both. Exponential profiles have no kinks; the logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ class SunColumns:
         place, column = lane // cosines % rows, lane % cosines
         low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
         x = t.Float(place) / self._rows
-        # Each end belongs to this shell's side of the break.
-        h = dr.fma(low - high, dr.clip(x, 1e-3, 1.0) ** 2, high)
+        h = dr.maximum(dr.fma(low - high, x * x, high), low)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
         totals = column_up(self.optics, h, mu, self._rule)
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
-        at_top = self.optics.densities(h)  # where the path has no length
+        # Where the path has no length: that on this shell's side of the break.
+        at_top = self.optics.densities(dr.fma(low - high, dr.maximum(x, 1e-3) ** 2, high))
         means = []
         for k, total in enumerate(totals):
             mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
@@ -99,15 +99,15 @@ class SunColumns:
         up = self._rising(h, dr.abs(mu), active)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
-        whole = self._rising(lowest, None, sinks)
+        whole = self._rising(lowest, 0.0, sinks)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
     def upward(self, h: Any) -> list[Any]:
         """Column density (m) of every constituent straight up from altitude ``h``."""
-        return self._rising(h, types().Float(1.0), True) if self._count else []
+        return self._rising(h, 1.0, True) if self._count else []
 
     def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
-        """Columns to the top from ``h`` along mu >= 0; None: horizontally."""
+        """Columns to the top from ``h`` along mu >= 0; a number for it is 0.0 or 1.0, an edge of the table."""
         t = types()
         cosines = self._cosines
         position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
@@ -118,10 +118,10 @@ class SunColumns:
         y = dr.safe_sqrt(depth) * self._rows
         below = dr.minimum(t.UInt(y), self._rows - 1)
         start = t.Float(below)
-        by_root = y - start
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
         corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
-        if mu is None:
+        if isinstance(mu, float):
+            corner += 0 if mu == 0.0 else cosines - 1
             near, far = (row(self.table, corner + offset, n, active=active) for offset in (0, cosines))
         else:
             x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
@@ -131,11 +131,24 @@ class SunColumns:
                 row(self.table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
             )
             near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
-        path = distance_up(self.optics.radius, h, 0.0 if mu is None else mu, self.optics.thickness)
+        path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
+        if not all(self._logarithmic):
+            # x under the break is sqrt(bend + x^2) - sqrt(bend) away from it, in units of a horizontal ray's first row.
+            r = self.optics.radius + high
+            bend = mu * mu * r * (0.5 * self._rows**2) * per_width
+            here, nearer, farther = (dr.sqrt(dr.fma(x, x, bend)) for x in (y, start, start + 1.0))
+            above, beneath = dr.maximum(here + nearer, 1e-30), here + farther
+            by_distance = by_altitude * ((farther + nearer) / above)
+            # Columns, not means, are linear: the paths to the top of the rows. Roots are large beside their difference.
+            step = dr.sqrt(2.0 * r / per_width) * (dr.fma(2.0, start, 1.0) / self._rows)
+            nearer = dr.maximum(dr.fma(-step, by_altitude / above, path), 0.0)
+            farther = dr.fma(step, (1.0 - by_altitude) / beneath, path)
         result = []
         for k in range(n):
-            mean = dr.lerp(near[k], far[k], by_altitude if self._logarithmic[k] else by_root)
-            result.append((dr.exp(mean) if self._logarithmic[k] else mean) * path)
+            if self._logarithmic[k]:
+                result.append(dr.exp(dr.lerp(near[k], far[k], by_altitude)) * path)
+            else:
+                result.append(dr.lerp(near[k] * nearer, far[k] * farther, by_distance))
         return result
 
 

@@ -1,7 +1,8 @@
 """The exceptions that users of atmo-jit see.
 
 Input that cannot be used raises :class:`InputError` (the command line prints its text and exits with 2); an LLVM
-library that would abort the process raises :class:`LLVMError` (exit status 1). Every message is one line.
+library that would abort the process raises :class:`LLVMError`, and a disk that takes no more :class:`OutputError` (exit
+status 1). Every message is one line.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ class AtmosphereError(InputError):
 
 class LLVMError(RuntimeError):
     """The LLVM library that Dr.Jit would load is missing or would abort the process. The message says what to do."""
+
+
+class OutputError(OSError):
+    """Files could not be written (a full disk, a folder that became write-protected). What was there before stays."""
 
 
 @contextmanager

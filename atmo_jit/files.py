@@ -25,7 +25,7 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from .errors import InputError, shown
+from .errors import InputError, OutputError, shown
 from .interrupts import uninterrupted
 
 # Larger archives are more likely a mistake or an attack than a list of views (this holds 26 million of them).
@@ -37,11 +37,20 @@ KINDS = "biuf"
 _TEMPORARY = re.compile(r"\.atmo-jit-(?P<host>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}(\.\w*)?")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file of that name; there is none of a name that the file system refuses (too long, a null
+    character)."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
     """``path`` as the name of a file that can be written, its links resolved.
 
-    Raises InputError when it does not end in ``suffix`` (in any case), is something other than a file, or its folder
-    does not exist or cannot be written.
+    Raises InputError when it does not end in ``suffix`` (in any case), is something other than a file, is write-
+    protected, or its folder does not exist or cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != suffix:
@@ -60,6 +69,7 @@ def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
         raise InputError(
             f"output {shown(str(path), 200)}: the folder {shown(str(target.parent), 200)} cannot be written"
         )
+    _check_writable(target)
     return target
 
 
@@ -86,8 +96,13 @@ def atomic_outputs(*paths: Path) -> Iterator[tuple[Path, ...]]:
 
     Whatever ends the block early, an exception or an interrupt, removes them and leaves ``paths`` as they were.
     Temporaries of processes that were killed on this machine are removed on the way.
+
+    Raises InputError where one of ``paths`` is write-protected, OutputError where one cannot be written (whatever
+    OSError ends the block counts as that).
     """
     targets = [Path(path).resolve() for path in paths]
+    for target in targets:
+        _check_writable(target)
     for folder in {target.parent for target in targets}:
         _remove_stale(folder)
     parts: list[Path] = []
@@ -103,6 +118,10 @@ def atomic_outputs(*paths: Path) -> Iterator[tuple[Path, ...]]:
                 os.replace(part, target)
         for folder in {target.parent for target in targets}:
             _sync(folder)
+    except OSError as error:
+        others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        name = shown(str(paths[0]), 200)
+        raise OutputError(f"output {name}{others}: cannot be written ({_reason(error)})") from error
     finally:
         with uninterrupted():
             for part in parts:
@@ -195,6 +214,12 @@ class _Replay:
 def _kind(dtype: np.dtype) -> str:
     names = {"b": "true/false values", "c": "complex numbers", "U": "text", "S": "text", "O": "Python objects"}
     return names.get(dtype.kind, f"values of type {shown(str(dtype))}")
+
+
+def _check_writable(target: Path) -> None:
+    """A new name in place of a write-protected file would be allowed, but not what its owner meant."""
+    if target.exists() and not os.access(target, os.W_OK):
+        raise InputError(f"output {shown(str(target), 200)}: is write-protected; must be a new or a writable file")
 
 
 def _create(target: Path) -> Path:

@@ -125,7 +125,7 @@ class Gather:
         cosines = self.grid.kept(("cosines", azimuths), lambda: floats(np.cos(half_circle(azimuths))))
 
         def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            values = [dr.maximum(v, 0.0) for v in packet(radiance, node * azimuths + j, 4)[:channels]]
+            values = packet(radiance, node * azimuths + j, 4)[:channels]
             return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j))
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 1) * channels)]

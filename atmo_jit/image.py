@@ -13,8 +13,14 @@ Luminance is that of the sRGB primaries (Rec. 709 weights).
 
 from __future__ import annotations
 
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +34,8 @@ KEY = 0.45
 HIGHLIGHT = 0.9
 # Pixels that are NaN or infinite are painted so that nobody mistakes them for the picture.
 INVALID_COLOUR = (1.0, 0.0, 1.0)
+# Larger pictures are more likely a mistake or an attack (this holds 178 million pixels of three channels).
+EXR_LIMIT = 2**31
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
 def write_exr(path: str | Path, picture: Picture, metadata: dict[str, str | float | int]) -> None:
     """Write a picture as float32 OpenEXR (ZIP), its colours linear with sRGB primaries.
 
-    metadata: further header attributes, text and numbers.
+    metadata: further header attributes, text and numbers. Raises OSError where the file cannot be written.
     """
     import OpenEXR
 
@@ -122,5 +130,50 @@ def write_exr(path: str | Path, picture: Picture, metadata: dict[str, str | floa
     }
     pixels = np.moveaxis(picture.pixels.astype(np.float32), -1, 0)
     channels = {name: np.ascontiguousarray(plane) for name, plane in zip(picture.channels, pixels, strict=True)}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
+    write_planes(path, header, channels)
+
+
+def write_planes(path: str | Path, header: dict[str, Any], planes: dict[str, np.ndarray]) -> None:
+    """Write channels as OpenEXR. Raises OSError where the file cannot be written, of which OpenEXR has another idea."""
+    import OpenEXR
+
+    with OpenEXR.File(header, dict(planes)) as file:  # which puts channels in the place of the arrays
+        try:
+            file.write(str(path))
+        except RuntimeError as error:
+            raise OSError(str(error).rpartition('". ')[2].rstrip(".")) from None
+
+
+def read_planes(path: str | Path) -> dict[str, np.ndarray]:
+    """The channels of an OpenEXR by name, [rows, columns]. Raises OSError, RuntimeError or ValueError for a file that
+    cannot be read, or whose pixels would take more than EXR_LIMIT bytes (which is seen before memory is taken)."""
+    import OpenEXR
+
+    with _hushed():
+        with OpenEXR.File(str(path), header_only=True) as file:
+            size = 0
+            for part in file.parts:
+                (left, top), (right, bottom) = (np.asarray(end).tolist() for end in part.header["dataWindow"])
+                size += 4 * (right - left + 1) * (bottom - top + 1) * len(part.header["channels"])
+        if size > EXR_LIMIT:
+            raise ValueError(f"its pixels would take more than {EXR_LIMIT} bytes")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    if len({plane.shape for plane in planes.values()}) != 1 or next(iter(planes.values())).ndim != 2:
+        raise ValueError("it has no channels, or some of other sizes")
+    return planes
+
+
+@contextmanager
+def _hushed() -> Iterator[None]:
+    """OpenEXR raises an exception for a damaged file and explains it on the terminal, in lines of its own."""
+    sys.stderr.flush()
+    former, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(former, 2)
+        os.close(former)
+        os.close(nowhere)

@@ -18,6 +18,7 @@ import sys
 from dataclasses import dataclass
 
 from .errors import LLVMError, one_line
+from .llvm_target import use_gathers
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 WHEEL = "karellen-llvm-core"
@@ -76,6 +77,7 @@ def require_llvm() -> None:
     state = state or examine()
     if state.remedy:
         raise LLVMError(state.remedy)
+    use_gathers()
     _checked = True
 
 

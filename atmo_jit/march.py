@@ -63,12 +63,16 @@ class Source(Protocol):
 
 
 def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
-    """Rays from ``h`` to whatever they meet first, the ground or the top."""
-    ground = hits_ground(optics.radius, h, mu)
-    stop = dr.select(
-        ground, distance_down(optics.radius, h, mu, 0.0), distance_up(optics.radius, h, mu, optics.thickness)
-    )
-    return Rays(h, mu, mu_s, nu, stop, ground)
+    """Rays from ``h`` to whatever they meet first, the ground or the top.
+
+    That is decided in the precision of ``h``: in single precision a ray 1e-7 rad off the horizon may be taken for one
+    on its other side, which sees other light.
+    """
+    t, wide = types(), type(h)
+    radius = wide(optics.radius)
+    ground = hits_ground(radius, h, mu)
+    stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, wide(optics.thickness)))
+    return Rays(*(t.Float(v) for v in (h, mu, mu_s, nu, stop)), t.Bool(ground))
 
 
 def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
@@ -97,16 +101,21 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     The perigee of the sunbeam through a point lies at altitude k where h (2R + h) - (r mu_s)^2 = k (2R + k): along a
     ray a quadratic in the distance, the cylinder of radius R + k about the axis through sun and planet. k = 0 is the
     planet's shadow; at the kinks of a profile the column toward the sun has a square-root edge. Only the far side of
-    the planet (mu_s < 0) counts.
+    the planet (mu_s < 0) counts. A disc sets (visible_sun) between the surfaces on which r mu_s = -sqrt(r^2 - R^2) +- R
+    times its radius: those of the shadow about axes moved by so much along the beam.
     """
     radius, r = optics.radius, optics.radius + rays.h
     a = (1.0 - rays.nu) * (1.0 + rays.nu)
-    b = r * (rays.mu - rays.mu_s * rays.nu)
     axial = r * rays.mu_s
     never = 2.0 * rays.stop + 1.0
     edges = []
-    for k in [parameter(level) for level in optics.edge_levels_m]:
-        c = (rays.h - k) * (2.0 * radius + rays.h + k) - axial * axial
+    disc = [-1.0, 1.0] if optics.atmosphere.sun_angular_radius_deg > 0.0 else []
+    sets = [sign * optics.radius * optics.sun_radius for sign in disc]
+    own = r * rays.mu
+    for k, moved in [*((parameter(level), None) for level in optics.edge_levels_m), *((0.0, by) for by in sets)]:
+        along = axial if moved is None else axial - moved
+        b = own - along * rays.nu
+        c = (rays.h - k) * (2.0 * radius + rays.h + k) - along * along
         discriminant = dr.fma(b, b, -a * c)
         q = -b - dr.copysign(dr.safe_sqrt(discriminant), b)
         for distance in (c / q, q / a):
@@ -114,7 +123,7 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
                 (discriminant > 0.0)
                 & dr.isfinite(distance)
                 & (distance > 0.0)
-                & (dr.fma(distance, rays.nu, axial) < 0.0)
+                & (dr.fma(distance, rays.nu, along) < 0.0)
             )
             edges.append(dr.select(counts, distance, never))
     return edges
@@ -183,7 +192,8 @@ class Cuts:
         self._optics, self._rays = optics, rays
         shells = shells or Shells(optics)
         self._breaks, self._last, self._shells = shells.breaks, shells.last, shells
-        self._perigee = perigee_altitude(optics.radius, rays.h, rays.mu)
+        # Rays that meet the ground end before their perigee; of others it is above, whatever its rounding says.
+        self._perigee = dr.maximum(perigee_altitude(optics.radius, rays.h, rays.mu), 0.0)
         self._r_mu = (optics.radius + rays.h) * rays.mu
         self._edges = _sunlight_edges(optics, rays) if sunlit else []
         self._farthest = MAX_TURN * optics.radius
@@ -215,6 +225,8 @@ class Cuts:
             rate = dr.select(depth < SPENT_DEPTH, dr.maximum(rate, densest), rate)
         longest = MAX_DEPTH / rate
         limit = d + dr.minimum(longest, self._farthest)
+        # The ray ends at the top, whatever the rounding of the crossing says.
+        crossing = dr.select(~falling & (shell >= self._last), rays.stop, crossing)
         end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)
         for edge in self._edges:
             end = dr.select(edge > d, dr.minimum(end, edge), end)

@@ -256,17 +256,20 @@ def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
     Reduced-rank extrapolation (Eddy 1979; Sidi 1991), per sun and channel: among the combinations sum_j gamma_j x_j,
     sum gamma_j = 1, of the partial sums x_j, the one whose residual sum_j gamma_j u_{j+1} (u: the orders) is
     smallest. With two orders it is the geometric tail; it is GMRES for the fixed point, and in a thick conservative
-    cloud some ten orders do the work of hundreds. The error is the norm of that residual over that of the sum, the
-    largest over suns and channels that have light.
+    cloud some tens of orders do the work of hundreds. What the sum lacks is the sum of all orders that follow from the
+    residual. Each is about rho times the one before, with rho the ratio of the last two orders, the largest under any
+    sun: so the error is the norm of the residual over that of the sum and over 1 - rho, the largest over suns and
+    channels that have light.
     """
     count, _, suns, _, size = orders.shape
     u = np.ascontiguousarray(np.moveaxis(orders, (2, 4), (0, 1)).reshape(suns, size, count, -1), dtype=np.float64)
     products = u @ np.swapaxes(u, -1, -2)
-    scale = np.trace(products, axis1=-2, axis2=-1)[..., None, None]
-    dark = scale <= 0.0
-    # A gram matrix of float32 data knows nothing below 1e-10 of its trace.
-    gram = np.where(dark, np.eye(count), products / np.where(dark, 1.0, scale) + 1e-10 * np.eye(count))
-    gamma = np.linalg.solve(gram, np.ones((suns, size, count, 1)))[..., 0]
+    norms = np.sqrt(np.einsum("scii->sci", products))
+    # Orders of one length: the late ones are faint beside the first, and it is they that count.
+    scale = 1.0 / np.where(norms > 0.0, norms, 1.0)
+    # A gram matrix of float32 data knows nothing below 1e-10.
+    gram = products * scale[..., :, None] * scale[..., None, :] + 1e-10 * np.eye(count)
+    gamma = scale * np.linalg.solve(gram, scale[..., None] / scale.max(axis=-1)[..., None, None])[..., 0]
     gamma = gamma / gamma.sum(axis=-1, keepdims=True)
     # x_j holds the orders before the j-th, so an order counts in every later partial sum.
     weights = 1.0 - np.cumsum(gamma, axis=-1)
@@ -274,7 +277,10 @@ def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
     def norm(combination: np.ndarray) -> np.ndarray:
         return np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", combination, products, combination), 0.0))
 
-    residual, whole = norm(gamma), norm(weights) + np.sqrt(products[..., 0, 0])
+    residual, whole = norm(gamma), norm(weights) + norms[..., 0]
     weights = weights + gamma  # the residual is the next term of the sum: take it too
-    error = np.divide(residual, whole, out=np.zeros_like(residual), where=whole > 0.0)
+    last, before = norms[..., -1], norms[..., -2]
+    ratio = np.divide(last, before, out=np.zeros_like(last), where=before > 0.0).max(axis=0)
+    error = np.divide(residual, whole, out=np.zeros_like(residual), where=whole > 0.0).max(axis=0)
+    error = np.where(ratio < 1.0, error / np.where(ratio < 1.0, 1.0 - ratio, 1.0), np.inf)
     return np.moveaxis(weights, -1, 0), float(error.max())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,14 +24,16 @@ class Passes:
 
     The passes' weighted sums and filter weights are added in float64 and divided once, so the picture is the same
     estimate that one pass with all samples would give. ``samples``: per pixel, in the passes done; ``total``: in all;
-    ``seed``: of the first pass. scatter: whether :meth:`standard_error` will be asked for, which takes time and memory.
+    ``pixels``: of the film; ``seed``: of the first pass. scatter: whether :meth:`standard_error` will be asked for,
+    which takes time and memory.
     """
 
     def __init__(self, scene: Any, spp: int | None, most: int = PASS_SAMPLES, scatter: bool = True) -> None:
         self._scene, self._sensor = scene, scene.sensors()[0]
         self._film, self._sampler = self._sensor.film(), self._sensor.sampler()
         self.total = spp or self._sampler.sample_count()
-        self._sizes = list(pass_sizes(self.total, int(np.prod(self._film.crop_size())), most))
+        self.pixels = int(np.prod(self._film.crop_size()))
+        self._sizes = list(pass_sizes(self.total, self.pixels, most))
         if len(self._sizes) == 1 and self.total > 1:  # one pass knows no standard error
             self._sizes = [self.total // 2, self.total - self.total // 2]
         # A film with more pixels than a pass may have samples is rendered in strips.
@@ -44,9 +46,10 @@ class Passes:
         self._squares: np.ndarray | float = 0.0
 
     def run(self, advance: Callable[[float], None]) -> Iterator[None]:
-        """Render, one pass at each step; ``advance`` is called with the fraction done."""
-        done = 0
-        for seed, count in enumerate(self._sizes):
+        """Render, one pass at each step, from where :meth:`restore` left it; ``advance`` is called with the fraction
+        done."""
+        done = sum(self._sizes[: self._done])
+        for seed, count in list(enumerate(self._sizes))[self._done :]:
             raw = self._pass(self.seed + seed, count)
             taken = self._sampler.sample_count()
             if self._scatter and self._done:
@@ -62,6 +65,30 @@ class Passes:
             done += count
             advance(done / self.total)
             yield
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What has to be kept of the passes done: with it the others give the same picture, but for the order in which
+        a pass adds its samples."""
+        counts = np.array([self._done, self.samples, self._grey])
+        return {"counts": counts, "channels": np.array(self._raw), "sums": self._sums, "squares": self._squares}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on after the passes of a :meth:`state`. Raises ValueError where it is not one of this picture."""
+        counts, channels = (np.asarray(state[name]) for name in ("counts", "channels"))
+        sums, squares = (np.asarray(state[name]) for name in ("sums", "squares"))
+        width, height = (int(n) for n in self._film.crop_size())
+        if counts.shape != (3,) or counts.dtype.kind != "i" or channels.ndim != 1 or channels.dtype.kind != "U":
+            raise ValueError("no counts or no names of channels")
+        done, samples, grey = (int(n) for n in counts)
+        raw = channels.tolist()
+        if not (0 < done <= len(self._sizes) and samples > 0 and {"R", "W"} <= set(raw) and len(set(raw)) == len(raw)):
+            raise ValueError(f"{done} passes, {samples} samples, channels {raw}")
+        scattered = self._scatter and done > 1
+        visible = height, width, len(raw) - (3 if grey else 1)
+        if sums.shape != (height, width, len(raw)) or squares.shape != (visible if scattered else ()):
+            raise ValueError(f"sums of shapes {sums.shape} and {squares.shape}")
+        self._done, self.samples, self._raw, self._grey = done, samples, raw, bool(grey)
+        self._sums, self._squares = sums.astype(np.float64), squares if scattered else 0.0
 
     def _pass(self, seed: int, count: int) -> np.ndarray:
         """The film's weighted sums after ``count`` samples per pixel."""

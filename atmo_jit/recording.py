@@ -11,28 +11,33 @@ from typing import Any
 
 import drjit as dr
 
-from .grid import Grid
+from .grid import arrays_in
 
 
 class Recordings:
-    """Recordings of functions whose arguments hold all that changes; what they read beside is kept with a grid.
+    """Recordings of functions whose arguments hold all that changes; what they read beside is kept with a grid, or with
+    the other objects that are given here.
 
     The first call of each is plain, since it makes what is kept. Derivatives do not pass through a recording: a
     function that is recorded may propagate them inside.
     """
 
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
+    def __init__(self, *keepers: Any) -> None:
+        self._keepers = keepers
         self._recorded: dict[Any, Callable[..., Any]] = {}
         self._used: set[Any] = set()
 
-    def run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What ``function`` returns; ``key`` tells functions apart."""
+    def run(self, key: Any, function: Callable[..., Any], *arguments: Any, prepare: Any = None) -> Any:
+        """What ``function`` returns; ``key`` tells functions apart. ``prepare``: the part of the function that makes
+        what is kept, called in place of the first, plain call: kernels differ where they are recorded, and those of the
+        rest are then compiled once."""
         if key not in self._used:
             self._used.add(key)
-            return function(*arguments)
+            if prepare is None:
+                return function(*arguments)
+            prepare(*arguments)
         if key not in self._recorded:
-            arrays = self._grid.arrays()
+            arrays = arrays_in(self._keepers)
             self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
         # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
         # collector has to wait.

@@ -27,7 +27,7 @@ from .field import Field
 from .geometry import safe_sine
 from .grid import Grid
 from .march import Rays, point_along, visible_sun
-from .optics import PHASE_NODES, Optics
+from .optics import PHASE_NODES, Optics, phase_node
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
 from .projection import add_harmonics, room, stored_harmonics
@@ -201,7 +201,7 @@ def _times_phase(optics: Optics, scattered: Any, ground: Any, grid: Grid, direct
         nu = dr.clip(dr.fma(across, cos_phi, along), -1.0, 1.0)
         values = [not_negative(_dot(taps, part)) for part in lit]
         if kinds:
-            x = (nu + 1.0) * (0.5 * (PHASE_NODES - 1))
+            x = phase_node(nu)
             cell = dr.minimum(t.UInt(x), PHASE_NODES - 2)
             f = x - t.Float(cell)
             low, high = (row(phases, cell + i, width, alone=True) for i in (0, 1))

@@ -18,6 +18,9 @@ from .refinement import Reference, Taps
 # Of the reference, squared: order 1 that is weaker, deep in the shadow, says nothing about later orders, and the
 # derivative of a quotient, which has a square below the line, must not leave single precision.
 DARK = 1e-16
+# Depth of air that scatters nothing to speak of: the square of a smaller one, which is below the line in a derivative,
+# leaves single precision.
+NOTHING = 1e-15
 FEW_LEFT = 0.01  # of order 1, and their ratio is steady
 
 
@@ -220,7 +223,7 @@ def _per_depth(optics: Optics, columns: SunColumns, grid: Grid) -> Any:
     """1 / scattering depth of the air above, table [K, channels]; 0 where there is none."""
     optics = optics.spread(grid.shape[0])
     above = optics.scattering_depths(columns.upward(grid.kept("altitudes", lambda: floats(grid.h))))
-    inverse = [dr.select(d > 0.0, 1.0 / dr.select(d > 0.0, d, 1.0), 0.0) for d in above]
+    inverse = [dr.select(d > NOTHING, 1.0 / dr.select(d > NOTHING, d, 1.0), 0.0) for d in above]
     return table_of(inverse, dr.arange(types().UInt, grid.shape[0]))
 
 

@@ -65,15 +65,20 @@ def bytes_kept(thing: Any) -> int:
 
 
 def timed(work: Any, repeats: int = REPEATS) -> dict[str, float]:
-    """Median wall and CPU seconds of ``work()``, which is called once before; of fewer runs where these take long."""
+    """Median wall and CPU seconds of ``work()`` and of all kernels that it starts; it is called once before. Of fewer
+    runs where these take long."""
+    import drjit as dr
+
     start = time.perf_counter()
     work()
+    dr.sync_thread()
     runs: list[tuple[float, float]] = []
     for _ in range(repeats):
         if runs and time.perf_counter() - start > ENOUGH_S:
             break
         cpu, wall = time.process_time(), time.perf_counter()
         work()
+        dr.sync_thread()
         runs.append((time.perf_counter() - wall, time.process_time() - cpu))
     wall, cpu = (statistics.median(column) for column in zip(*runs, strict=True))
     return {"wall_s": wall, "cpu_s": cpu}

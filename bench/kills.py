@@ -3,13 +3,12 @@
     python -m bench.kills --count 50
 
 Ctrl-C, SIGTERM and SIGKILL at any moment from the start to beyond the end of render, export, sky, fit and bench, and
-disks that are full after some bytes (RLIMIT_FSIZE). Afterwards every command runs once undisturbed, after which nothing
-temporary may be left.
+disks that are full after some bytes (RLIMIT_FSIZE). What is kept of interrupted work is whole too, and --resume goes on
+from it. Afterwards every command runs once undisturbed, after which nothing temporary may be left.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -28,9 +27,9 @@ import numpy as np
 
 from atmo_jit.export.containers import read_exr
 from atmo_jit.files import read_npz
-from atmo_jit.progress import progress_bar
 
-from .hostile import CONFIG
+from .counted import command
+from .hostile_targets import CONFIG
 
 OLD = b"old"
 WAYS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, "full disk")
@@ -45,11 +44,14 @@ READERS: dict[str, Callable[[Path], Any]] = {
 
 
 # The command line, where files cannot grow beyond some bytes, and which a shell's background job does not make deaf.
+# What can be resumed is kept at every step.
 LIMITED = """
 import resource, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python starts, an interrupt just ends it
 if (limit := int(sys.argv[1])) >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+from atmo_jit import partial
+partial.KEEP_SECONDS = 0.0
 from atmo_jit.cli import main
 sys.exit(main(sys.argv[2:]))
 """
@@ -57,17 +59,20 @@ sys.exit(main(sys.argv[2:]))
 
 @dataclass
 class Work:
-    """A command line (after ``atmo-jit``), the folder it writes to, and the files that it leaves there."""
+    """A command line (after ``atmo-jit``), the folder it writes to, the files that it leaves there, and the ``kept``
+    one that it goes on from."""
 
+    name: str
     arguments: tuple[str, ...]
     folder: Path
     outputs: tuple[str, ...]
+    kept: str | None
     seconds: float = 0.0
 
     def start(self, limit: int | None = None) -> subprocess.Popen:
         """The running command; ``limit``: bytes that a file may have."""
-
-        command = [sys.executable, "-c", LIMITED, str(-1 if limit is None else limit), *self.arguments]
+        more = ["--resume"] if self.kept else []
+        command = [sys.executable, "-c", LIMITED, str(-1 if limit is None else limit), *self.arguments, *more]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def lay_old(self) -> None:
@@ -77,9 +82,9 @@ class Work:
             (self.folder / name).write_bytes(OLD)
 
     def broken(self) -> list[str]:
-        """Outputs that are neither old nor complete."""
+        """Outputs that are neither old nor complete, and what was kept if it is not."""
         found = []
-        for name in self.outputs:
+        for name in (*self.outputs, *([self.kept] if self.resumes() else [])):
             path = self.folder / name
             try:
                 if path.read_bytes() != OLD:
@@ -89,8 +94,12 @@ class Work:
         return found
 
     def temporaries(self) -> list[str]:
-        """Names of what is in the folder beside the outputs."""
-        return sorted(set(os.listdir(self.folder)) - set(self.outputs))
+        """Names of what is in the folder beside the outputs and what is kept."""
+        return sorted(set(os.listdir(self.folder)) - {*self.outputs, self.kept})
+
+    def resumes(self) -> bool:
+        """Whether something was kept."""
+        return self.kept is not None and (self.folder / self.kept).exists()
 
 
 def works(folder: Path, names: tuple[str, ...]) -> list[Work]:
@@ -104,18 +113,21 @@ def works(folder: Path, names: tuple[str, ...]) -> list[Work]:
              wavelengths_nm=[680.0, 550.0, 440.0])  # fmt: skip
     (folder / "fit.toml").write_text(CONFIG, encoding="utf-8")
 
-    def work(name: str, arguments: str, *outputs: str) -> Work:
+    def work(name: str, arguments: str, *outputs: str, kept: str | None = None) -> Work:
         place = {"here": str(folder), "out": str(folder / name)}
-        return Work((name, *(part.format(**place) for part in arguments.split())), folder / name, outputs)
+        return Work(name, tuple(part.format(**place) for part in arguments.split()), folder / name, outputs, kept)
 
+    picture = "noon --width 48 --height 27 --spp 16 --out {out}/a.exr"
+    fit = "fit --observations {here}/scan.npz --config {here}/fit.toml --out {out}/a.json"
     every = [
-        work("sky", "--atmosphere earth --views {here}/views.npz --out {out}/a.npz", "a.npz"),
-        work("render", "noon --width 48 --height 27 --spp 16 --out {out}/a.exr", "a.exr", "a.png"),
-        work("export", "--atmosphere earth --layout power3d --size 8x16x16 --out {out}", "params.json"),
-        work("fit", "--observations {here}/scan.npz --config {here}/fit.toml --out {out}/a.json", "a.json", "a.png"),
-        work("bench", "--quick --part stages --out {out}", "bench.json", "bench.md"),
+        work("sky", "sky --atmosphere earth --views {here}/views.npz --out {out}/a.npz", "a.npz"),
+        work("render", f"render {picture}", "a.exr", "a.png"),
+        work("reference", f"render {picture} --reference", "a.exr", "a.png", kept="a.partial.npz"),
+        work("export", "export --atmosphere earth --layout power3d --size 8x16x16 --out {out}", "params.json"),
+        work("fit", fit, "a.json", "a.png", kept="a.partial.json"),
+        work("bench", "bench --quick --part stages --out {out}", "bench.json", "bench.md"),
     ]
-    return [w for w in every if w.arguments[0] in names]
+    return [w for w in every if w.name in names]
 
 
 def _starts(path: Path, start: bytes) -> None:
@@ -124,7 +136,7 @@ def _starts(path: Path, start: bytes) -> None:
 
 
 def kill(
-    count: int, seed: int = 0, names: tuple[str, ...] = ("sky", "render", "export", "fit", "bench"),
+    count: int, seed: int = 0, names: tuple[str, ...] = ("sky", "render", "reference", "export", "fit", "bench"),
     advance: Callable[[float], None] | None = None,
 ) -> tuple[Counter, list[str]]:  # fmt: skip
     """How often a command ended with which status after what, and a line for every output that was broken."""
@@ -152,38 +164,41 @@ def kill(
                     process.send_signal(way)
             _, text = process.communicate()
             label = way if full else way.name
-            found[work.arguments[0], label, process.returncode] += 1
-            what = f"{work.arguments[0]}, {label}, {seed}:{number}: "
+            found[work.name, label, f"status {process.returncode}"] += 1
+            what = f"{work.name}, {label}, {seed}:{number}: "
             wrong += [what + line for line in work.broken()]
-            if full and (process.returncode == 0) == any((work.folder / n).read_bytes() == OLD for n in work.outputs):
+            old = any((work.folder / n).read_bytes() == OLD for n in work.outputs)
+            # A path-traced picture is written on the way too.
+            if full and (old if process.returncode == 0 else not old and work.name != "reference"):
                 wrong.append(f"{what}status {process.returncode} says otherwise")
             if "Traceback" in text:
                 wrong.append(f"{what}{text.strip().splitlines()[-1]}")
             if way != signal.SIGKILL and work.temporaries():
                 wrong.append(f"{what}left {work.temporaries()}")
+            if work.resumes():
+                found[work.name, label, "kept"] += 1
+                wrong += [what + line for line in _resumed(work)]
             if advance:
                 advance((number + 1) / count)
         for work in every:
             work.start().communicate()
-            if work.temporaries():
-                wrong.append(f"{work.arguments[0]}: a next run left {work.temporaries()}")
+            if work.temporaries() or work.resumes():
+                wrong.append(f"{work.name}: a next run left {sorted(os.listdir(work.folder))}")
     return found, wrong
 
 
-def main() -> int:
-    """Stop them and print what came of it."""
-    parser = argparse.ArgumentParser(prog="python -m bench.kills", description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=50, help="default: %(default)s")
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
-    options = parser.parse_args()
-    with progress_bar("kills") as advance:
-        found, wrong = kill(options.count, options.seed, advance=advance)
-    for (name, way, status), count in sorted(found.items()):
-        print(f"{name}: {way}: status {status}: {count}")
-    print("\n".join(wrong))
-    print(f"{options.count} kills, {len(wrong)} wrong")
-    return int(bool(wrong))
+def _resumed(work: Work) -> list[str]:
+    """What is wrong after a command that went on from what was kept."""
+    work.lay_old()
+    process = work.start()
+    _, text = process.communicate()
+    old = [name for name in work.outputs if (work.folder / name).read_bytes() == OLD]
+    if process.returncode or old or work.resumes():
+        return [f"resumed with status {process.returncode}: {text.strip()}; old: {old}; {os.listdir(work.folder)}"]
+    return work.broken()
 
+
+main = command("bench.kills", __doc__, "kills", 50, lambda count, seed, advance: kill(count, seed, advance=advance))
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -38,6 +38,9 @@ FAINT = 1e-3  # of the brightest single scattering under the same sun: errors of
 Errors = dict[str, np.ndarray]
 
 GRAZING = 1e-6  # planet radii
+# Of the altitude: a ray whose perigee is nearer to the ground grazes it, and whether it meets it is for the rounding of
+# its angle and of the radius to say.
+UNDECIDED = 1e-7
 
 ABOUT = {
     "not finite": "radiance, transmittance, irradiances: values that are NaN or infinite (count)",
@@ -126,7 +129,7 @@ def check_world(world: Mapping[str, Any], views: dict[str, np.ndarray], twin: An
         "transmittance above 1": np.maximum(arrays[1] - 1.0, 0.0),
     }
     errors |= _along(world, views, solved, arrays[0])
-    errors |= _of_twin(world, views, arrays, twin)
+    errors |= of_twin(world, views, arrays, twin)
     if solves:
         errors |= _of_solves(world, views, arrays[0])
     return errors
@@ -168,9 +171,12 @@ def _along(world: Mapping[str, Any], views: dict[str, np.ndarray], solved: Solve
     }
 
 
-def _of_twin(world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[np.ndarray], twin: Any) -> Errors:
+def of_twin(world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[np.ndarray], twin: Any) -> Errors:
     """Differences from the quadrature twin, in double precision."""
-    inside = np.flatnonzero(views["altitude_m"] < world["top_radius_m"] - world["bottom_radius_m"])[:TWIN_VIEWS]
+    altitude, cosine = views["altitude_m"], np.cos(np.radians(views["view_zenith_deg"]))
+    perigee = altitude - (twin.radius + altitude) * cosine**2 / (1.0 + np.sqrt(1.0 - cosine**2))
+    compared = (altitude < twin.top) & ~((cosine < 0.0) & (np.abs(perigee) < UNDECIDED * altitude))
+    inside = np.flatnonzero(compared)[:TWIN_VIEWS]
     some = {name: values[inside] for name, values in views.items()}
     if not inside.size:
         return {}
@@ -219,7 +225,9 @@ def check_derivatives(rng: Random, world: Mapping[str, Any], views: dict[str, np
     by = at.jacobian(chosen)
     noise = np.random.default_rng(rng.randrange(2**32))
     values = {n: np.asarray(at.views[n] if n in VIEWS else described(at.atmosphere, n), float) for n in chosen}
-    change = {n: noise.normal(size=v.shape) * 0.01 * np.abs(v) for n, v in values.items()}
+    # The end of a ray without end does not move.
+    sizes = {n: 0.01 * np.where(np.isfinite(v), np.abs(v), 0.0) for n, v in values.items()}
+    change = {n: noise.normal(size=size.shape) * size for n, size in sizes.items()}
     weights = {output: noise.normal(size=at.value[output].shape) for output in OUTPUTS}
     moved, pulled = at.jvp(change), at.vjp(weights, chosen)
     forward = sum(np.vdot(weights[output], moved[output]) for output in OUTPUTS)

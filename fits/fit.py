@@ -18,23 +18,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from atmo_jit.errors import InputError
-from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
-from .forward import ROUGH
+from .kept import Point, Report
 from .observations import Observations
-from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise
+from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise, steps_ahead
 from .problem import HUBER, Evaluation, Problem, without_darkness
+from .starts import check_count, check_units, few_of, fits, starting_points
 from .uncertainty import Uncertainty, uncertainty
 
-FEW = 128  # samples (directions) that the first steps look at, or
-FEW_EACH = 32  # of each scan, or
-FEW_FOLD = 8  # as many times the unknowns, whichever is most
-UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
-RESTARTS = 3
 ROUNDS = 12  # of loss and weights, each of
 FIRST_ITERATIONS = 10
 STEPS_FORESEEN = 3
@@ -67,12 +62,23 @@ class Fit:
         return dict(zip((s.name for s in self.problem.scalars), self.problem.values(self.u).tolist(), strict=True))
 
 
-def fit(data: Observations, config: FitConfig, progress: Progress | None = None) -> Fit:
+def fit(
+    data: Observations,
+    config: FitConfig,
+    progress: Progress | None = None,
+    keep: Callable[[Point], None] | None = None,
+    begun: Point | None = None,
+) -> Fit:
     """Fit the free values of ``config`` to ``data``. ``progress`` is called with an estimate of the fraction done.
 
-    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right.
+    ``keep`` is called with every point from which another call can go on when it has ``begun`` there. That comes to the
+    same minimum, to a part of the standard errors that ends a search (a tenth), since it does not know the Jacobians of
+    the steps before.
+
+    Raises InputError for data that cannot be fitted: fewer samples than unknowns, units that cannot be right; for a
+    point of another fit.
     """
-    started = time.perf_counter()
+    started = time.perf_counter() - (begun.seconds if begun else 0.0)
     air = at_wavelengths(config.atmosphere, data.wavelengths_nm)
     before = np.count_nonzero(data.used)
     if config.residual == "log":
@@ -80,24 +86,26 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     everything, data = data, data.part(np.flatnonzero(data.used.any(axis=1)))
     samples = int(np.count_nonzero(data.used))
     whole = Problem.of(replace(config, atmosphere=air), data)
-    _check_count(whole, samples)
-    few = _few(whole)
-    few.model.place(few.atmosphere_values(few.start))
-    _check_units(few)
-    report = _Report(progress)
-    tries = []
-    for start in _starting_points(few):
-        tries.append(_minimum(few, start, report))
-        if tries[-1].solution.converged and not _poor(tries[-1]):
-            break
-        if len(tries) > RESTARTS:
-            break
-    # Poor ends are compared by their residuals, whose scale does not change with the loss.
-    best = min(tries, key=lambda end: _scale(end.left))
-    end = _polished(whole, whole.spread(few, best.solution.u), report)
+    check_count(whole, samples)
+    few = few_of(whole)
+    if config.optimiser == "levenberg_marquardt":
+        for problem in (few, whole):
+            steps_ahead(len(problem.scalars))
+    if begun is None:
+        few.model.place(few.atmosphere_values(few.start))
+        check_units(few)
+        begun = Point(0, (), tuple(few.start), tuple(few.start))
+    elif not fits(begun, few, whole):
+        raise InputError("begun: is a point of another fit")
+    report = Report(progress, keep, begun, started)
+    if begun.step == 0:
+        _search(few, whole, report)
+    step = max(begun.step, 1)
+    end = _polished(whole, report)
     # Where the model errs more than the data, finer nodes show nothing.
-    if end.problem.excess == 1.0 and whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
-        end = _polished(whole, end.solution.u, report)
+    if step == 1 and end.problem.excess == 1.0 and whole.model.too_coarse(whole.atmosphere_values(end.solution.u)):
+        report.reached(step=2, nodes=end.solution.u, u=end.solution.u)
+        end = _polished(whole, report)
     problem, u, solution = end.problem, end.solution.u, end.solution
     found = replace(problem.evaluate(u), jacobian=solution.jacobian)
     errors = uncertainty(problem, u, found)
@@ -106,20 +114,8 @@ def fit(data: Observations, config: FitConfig, progress: Progress | None = None)
     if len(masked.radiance):
         unseen = masked, Problem(problem.config, masked, problem.model.at(masked), problem.leaves).evaluate(u).predicted
     seconds = time.perf_counter() - started
-    return Fit(problem, u, found, errors, solution, len(tries), seconds, int(before - samples), unseen)
-
-
-class _Report:
-    """Progress over all minimisations: every iteration takes a share of what is left."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self._progress, self._left, self.iterations = progress, 1.0, 0
-
-    def __call__(self, iteration: int, cost: float) -> None:
-        self.iterations += 1
-        self._left *= 0.9
-        if self._progress is not None:
-            self._progress(1.0 - self._left)
+    starts = len(report.point.ends)
+    return Fit(problem, u, found, errors, solution, starts, seconds, int(before - samples), unseen)
 
 
 @dataclass(frozen=True)
@@ -135,13 +131,31 @@ class _End:
         return self.problem.evaluate(self.solution.u).raw[self.problem.data.used]
 
 
-def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
+def _search(few: Problem, whole: Problem, report: Report) -> None:
+    """The best minimum for some of the samples, from where the report's point is and, where that ends poorly, from
+    other starts; as the point from which all samples are looked at."""
+    few.model.place(few.atmosphere_values(np.array(report.point.nodes)))
+    ends = [np.array(end) for end in report.point.ends]
+    for start in [np.array(report.point.u), *starting_points(few)[len(ends) + 1 :]]:
+        report.reached(ends=ends, u=start)
+        end = _minimum(few, start, report)
+        ends.append(end.solution.u)
+        if end.solution.converged and not _poor(end):
+            break
+    # Poor ends are compared by their residuals, whose scale does not change with the loss.
+    best = whole.spread(few, min(ends, key=lambda u: _scale(few.evaluate(u).raw[few.data.used])))
+    report.reached(step=1, ends=ends, nodes=best, u=best)
+
+
+def _minimum(few: Problem, start: np.ndarray, report: Report) -> _End:
     """The minimum for some of the samples from one start; with a loss and weights that suit what is left there."""
     u, known = start, None
     for _ in range(ROUNDS):
+        nodes = {}
         if few.model.strays(few.atmosphere_values(u)):
             few.model.place(few.atmosphere_values(u))
-            known = None
+            known, nodes = None, {"nodes": u}
+        report.reached(u=u, **nodes)
         problem = _weighed(few, u)
         solution = _solve(problem, u, report, FIRST_TOLERANCE, FIRST_ITERATIONS, known)
         u, known = solution.u, (solution.u, solution.jacobian)
@@ -151,10 +165,11 @@ def _minimum(few: Problem, start: np.ndarray, report: _Report) -> _End:
     return end
 
 
-def _polished(whole: Problem, u: np.ndarray, report: _Report) -> _End:
-    """The minimum for all samples, on nodes for the atmosphere at ``u``."""
-    whole.model.place(whole.atmosphere_values(u))
-    problem = _weighed(whole, u)
+def _polished(whole: Problem, report: Report) -> _End:
+    """The minimum for all samples, on nodes and with weights for the atmosphere that the report's point names."""
+    nodes, u = np.array(report.point.nodes), np.array(report.point.u)
+    whole.model.place(whole.atmosphere_values(nodes))
+    problem = _weighed(whole, nodes)
     last = _solve(problem, u, report, STEP_TOLERANCE)
     return _End(problem, replace(last, iterations=report.iterations))
 
@@ -181,7 +196,7 @@ def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def _solve(
     problem: Problem,
     u: np.ndarray,
-    report: _Report,
+    report: Report,
     enough: float,
     iterations: int = MAX_ITERATIONS,
     known: tuple[np.ndarray, np.ndarray] | None = None,
@@ -232,62 +247,3 @@ def _poor(end: _End) -> bool:
     measured = data.radiance[data.used]
     relative = float(np.median(np.abs(found.predicted[data.used] - measured) / np.maximum(np.abs(measured), 1e-30)))
     return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
-
-
-def _starting_points(whole: Problem) -> list[np.ndarray]:
-    """The start, then logarithmic scalars ten times larger and smaller and the others in the middle of their ranges."""
-    points = [whole.start]
-    for factor in (10.0, 0.1, 1.0):
-        middle = [
-            s.inner(s.start * factor) if s.logarithmic and not s.nuisance else 0.0 if s.bounded else s.inner(s.start)
-            for s in whole.scalars
-        ]
-        points.append(np.array(middle))
-    return points
-
-
-def _few(whole: Problem) -> Problem:
-    """The problem for some directions, and as many wavelengths as are solved at once."""
-    rows = _some(whole.data, max(FEW, FEW_EACH * whole.data.scans, FEW_FOLD * len(whole.scalars)))
-    count = len(whole.data.wavelengths_nm)
-    if whole.data.mixing is not None or count <= MAX_CHANNELS:
-        return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
-    order = np.argsort(whole.data.wavelengths_nm)
-    channels = np.sort(order[np.linspace(0, count - 1, MAX_CHANNELS).round().astype(int)])
-    return whole.part(rows, channels, max(whole.config.tolerance, ROUGH))
-
-
-def _some(data: Observations, count: int) -> np.ndarray:
-    """At most ``count`` rows, spread evenly over the order of the data, as many of each scan as it has part."""
-    total = len(data.radiance)
-    if total <= 2 * count:
-        return np.arange(total)
-    rows = np.sort(np.random.default_rng(0).permutation(total)[:count])
-    missing = [int(np.flatnonzero(data.scan == s)[0]) for s in range(data.scans) if not np.any(data.scan[rows] == s)]
-    return np.union1d(rows, np.array(missing, int))
-
-
-def _check_count(problem: Problem, samples: int) -> None:
-    unknowns = sum(not np.isfinite(s.prior_sigma) for s in problem.scalars)
-    if samples < max(unknowns, 1):
-        raise InputError(
-            f"observations: {samples} samples for {unknowns} unknowns without a prior; needed are at least {unknowns}"
-        )
-
-
-def _check_units(problem: Problem) -> None:
-    """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
-    if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
-        return  # the calibration is free: any unit will do
-    ratio = np.inf
-    for factor in (1.0, 0.1, 10.0):
-        u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
-        predicted = problem.evaluate(np.array(u)).predicted[problem.data.used]
-        found = float(np.median(problem.data.radiance[problem.data.used] / np.maximum(predicted, 1e-30)))
-        ratio = min(ratio, found, key=lambda r: abs(np.log(max(r, 1e-30))))
-        if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
-            return
-    raise InputError(
-        f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
-        "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
-    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -26,6 +27,8 @@ FARTHEST = 30.0  # u between which L-BFGS-B looks
 UNKNOWN = 1e-14  # of the largest curvature, below which there is none
 DAMPING = 1e-4  # at the start, of the largest square
 COST_TOLERANCE = 1e-10  # relative decrease below which rounding decides
+
+Progress = Callable[[int, float, np.ndarray], None]
 
 
 @dataclass(frozen=True)
@@ -141,10 +144,11 @@ def minimise(
     method: str = "levenberg_marquardt",
     max_iterations: int = MAX_ITERATIONS,
     step_tolerance: float = STEP_TOLERANCE,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Solution:
     """Minimise the sum of the loss from ``start``. ``step_tolerance``: a step that gains less than this part of the
-    standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration and cost.
+    standard errors (root mean square over the unknowns) is the last. ``progress`` is called with iteration, the
+    least cost so far, and where that is.
     """
     run = {"levenberg_marquardt": _levenberg_marquardt, "lbfgsb": _lbfgsb}[method]
     jax, _ = _jaxopt()
@@ -180,7 +184,7 @@ class _Steps:
         self._solver = jaxopt.LevenbergMarquardt(
             residual, materialize_jac=True, solver="cholesky", jit=True, implicit_diff=False
         )
-        self._state_type = type(jax.eval_shape(self._solver.init_state, jnp.zeros(size)))
+        self._state_type = type(jax.eval_shape(self._solver.init_state, jax.ShapeDtypeStruct((size,), jnp.float64)))
 
     def _on_host(self, which: int, u: Any) -> np.ndarray:
         """Small residuals (0) or Jacobian (1); JAX would hide an error that passed through it."""
@@ -230,14 +234,39 @@ class _Steps:
         return u, state
 
 
-_steps_for = lru_cache(maxsize=16)(_Steps)
+class _Bowl:
+    """Half of the squared distance to the origin: what :class:`_Steps` is compiled on."""
+
+    def cost(self, u: np.ndarray) -> float:
+        return 0.5 * float(u @ u)
+
+    def small(self, u: np.ndarray, more: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.append(u, np.sqrt(2.0 * more)), np.vstack([np.eye(len(u)), np.zeros(len(u))])
+
+
+_aside = ThreadPoolExecutor(1, thread_name_prefix="atmo-jit-steps")
+
+
+@lru_cache(maxsize=16)
+def steps_ahead(size: int) -> Future[_Steps]:
+    """Steps for this many unknowns, compiled in a thread of its own: to import and compile them takes about as long as
+    the kernels of the first sky, which does not wait for them."""
+    return _aside.submit(_compiled, size)
+
+
+def _compiled(size: int) -> _Steps:
+    jax, _ = _jaxopt()
+    with jax.enable_x64(True):
+        steps, start = _Steps(size), np.ones(size)
+        steps(start, steps.start(_Bowl(), start))
+    return steps
 
 
 def _levenberg_marquardt(
-    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Progress
 ) -> Solution:
     """Steps of :class:`_Steps` until they gain nothing."""
-    steps, u = _steps_for(len(start)), start
+    steps, u = steps_ahead(len(start)).result(), start
     state = steps.start(functions, start)
     best = steps.best
 
@@ -250,8 +279,8 @@ def _levenberg_marquardt(
         step, now = state.delta, functions.cost(u + state.delta)
         if not np.all(np.isfinite(step)):
             return done(u, iteration, False, "the data do not depend on a parameter: no step exists")
-        progress(iteration, min(now, best))
         gain = best - now
+        progress(iteration, min(now, best), u_next if gain > 0.0 else u)
         if gain > 0.0:
             best = steps.best = now
             u, failures = u_next, 0
@@ -272,7 +301,7 @@ def _levenberg_marquardt(
 
 
 def _lbfgsb(
-    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Callable[[int, float], None]
+    functions: Residuals, start: np.ndarray, max_iterations: int, enough: float, progress: Progress
 ) -> Solution:
     """L-BFGS-B (Byrd et al. 1995) on the sum itself: SciPy's by way of jaxopt, whose own takes a minute to trace."""
     _, jaxopt = _jaxopt()
@@ -285,7 +314,7 @@ def _lbfgsb(
     def after(u: Any) -> None:
         points.append(np.array(u, dtype=float))
         change = functions.cost(points[-2]) - functions.cost(points[-1])
-        progress(len(points) - 1, functions.cost(points[-1]))
+        progress(len(points) - 1, functions.cost(points[-1]), points[-1])
         # How far Newton's step would lead.
         ahead = functions.small(u, functions.cost(u))[0][:-1]
         if np.linalg.norm(ahead) < enough * np.sqrt(len(ahead)):

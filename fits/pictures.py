@@ -35,6 +35,8 @@ import numpy as np
 
 from atmo_jit import scenes
 from atmo_jit.errors import InputError, shown
+from atmo_jit.files import is_file
+from atmo_jit.image import read_planes
 from atmo_jit.spectrum import SpectralBasis
 
 from .camera import angles_deg, of_scene, perspective, rotation
@@ -155,7 +157,7 @@ def _settings(
         if not isinstance(given.get("scene"), str):
             raise InputError(f"picture.scene: is {shown(given.get('scene'))}; must be the name of a scene file")
         beside = folder / given["scene"]
-        path = scenes.find(str(beside) if beside.is_file() else given["scene"])
+        path = scenes.find(str(beside) if is_file(beside) else given["scene"])
         defaults |= {"sun_zenith_deg": 0.0}
         if size is not None:
             found["camera"] = of_scene(path, *size)
@@ -176,12 +178,11 @@ def _settings(
 
 def _read(path: Path, name: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """Pixels [height, width, channels] and the names of the channels: R, G, B in this order, others by name."""
-    import OpenEXR
-
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {key: np.array(channel.pixels) for key, channel in file.channels().items()}
+        channels = read_planes(path)
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{name}: cannot be read as OpenEXR ({shown(str(error), 100)})") from None
     names = [key for key in ("R", "G", "B") if key in channels] or sorted(set(channels) - {"A"})
+    if not names:
+        raise InputError(f"{name}: has no channels but A; must have R, G, B or one for each wavelength")
     return np.stack([channels[key] for key in names], axis=-1), tuple(names)

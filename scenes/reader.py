@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from atmo_jit.errors import InputError, one_line
+from atmo_jit.files import is_file
+from atmo_jit.partial import digest
 from atmo_jit.scenes import json_form
 
 # Mitsuba's own film size, for a film that states none.
@@ -58,6 +62,29 @@ def load_scene(
     if scene.integrator() is None:
         raise InputError(f"{path}: the scene has no integrator")
     return scene
+
+
+def contents(state: Any) -> str:
+    """Tells parsed scenes from each other by their objects' properties and the files that these name (meshes, textures,
+    atmospheres)."""
+    import mitsuba as mi
+
+    found: list[bytes | Path] = []
+    for node in state.nodes:
+        found.append(f"{node.type} {node.props.plugin_name()} {node.props.id()}".encode())
+        for key in node.props.keys():
+            value = node.props[key]
+            if isinstance(value, str):
+                file = Path(str(mi.file_resolver().resolve(value)))
+                if is_file(file):  # a string may be anything
+                    found.append(file)
+            if not isinstance(value, str | int | float):  # what Mitsuba prints of arrays is rounded
+                with suppress(TypeError, ValueError):
+                    # Asked of the type: an array has any attribute, as swizzling.
+                    numbers = value.matrix if hasattr(type(value), "matrix") else value
+                    found.append(np.asarray(numbers, float).tobytes())
+            found.append(f"{key} {value!r}".encode())
+    return digest(*found)
 
 
 def _parse_xml(path: Path, config: Any, parameters: Mapping[str, str]) -> Any:

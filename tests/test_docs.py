@@ -41,10 +41,43 @@ def test_names_of_the_glossary_are_used():
     assert len(named) > 50 and not named - words
 
 
+def outside_of_code(page):
+    """The page's text without what is set as code."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return re.sub(r"`[^`]*`", "code", re.sub(r"^    .*$", "", text, flags=re.MULTILINE))
+
+
+def anchors(page):
+    """What headings may be linked as."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
-    assert all((page.parent / link).is_file() for link in links)
+    """Files, pictures, and headings."""
+    for link in re.findall(r"\]\(([^)]+)\)", outside_of_code(page)):
+        if re.match(r"https?://", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_are_well_formed(page):
+    """What a reader of Markdown would take for something else: rows of tables that lack cells or have too many, code
+    that does not end, headings that skip a level, links without an end."""
+    text = outside_of_code(page)
+    assert "`" not in text and not re.search(r"\]\([^)]*$", text, re.MULTILINE)
+    assert page.read_text(encoding="utf-8").count("\n```") % 2 == 0
+    levels = [len(marks) for marks in re.findall(r"^(#+) ", text, re.MULTILINE)]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in zip(levels, levels[1:], strict=False))
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        rows = [row.count("|") for row in table.splitlines()]
+        assert set(rows) == {rows[0]} and re.fullmatch(r"[|: -]+", table.splitlines()[1]), table
 
 
 def test_the_page_of_plugins_is_that_of_their_docstrings():

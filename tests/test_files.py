@@ -12,7 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from atmo_jit.errors import InputError
+from atmo_jit.errors import InputError, OutputError
 from atmo_jit.files import atomic_outputs, check_output, read_npz
 
 # --- output --------------------------------------------------------------------------------------------------------
@@ -40,7 +40,8 @@ def test_an_existing_file_survives_a_failed_run(tmp_path, failure):
 
 
 def test_nothing_is_renamed_when_a_file_is_missing(tmp_path):
-    with pytest.raises(FileNotFoundError), atomic_outputs(tmp_path / "a.exr", tmp_path / "b.png") as (_, other):
+    names = tmp_path / "a.exr", tmp_path / "b.png"
+    with pytest.raises(OutputError, match="No such file"), atomic_outputs(*names) as (_, other):
         other.unlink()
     assert os.listdir(tmp_path) == []
 
@@ -96,13 +97,6 @@ def test_check_output_refuses_what_cannot_be_written(tmp_path):
         with pytest.raises(InputError) as caught:
             check_output(tmp_path / name, ".npz")
         assert str(caught.value).startswith("output ") and str(caught.value).isprintable()
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write everywhere")
-def test_check_output_refuses_a_folder_that_cannot_be_written(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match="cannot be written"):
-        check_output(tmp_path / "a.npz", ".npz")
 
 
 # --- input ---------------------------------------------------------------------------------------------------------

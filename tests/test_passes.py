@@ -68,7 +68,7 @@ def test_large_films_are_rendered_in_strips(monkeypatch):
     was.
     """
     with _mitsuba("llvm_ad_rgb"):
-        scene = _load(find("ball"), {}, 24, 14, False)
+        scene, _ = _load(find("ball"), {}, 24, 14, False)
         pictures, errors = [], []
         for most in (2**21, 24 * 4):
             passes = Passes(scene, 64, most)
@@ -84,7 +84,7 @@ def test_large_films_are_rendered_in_strips(monkeypatch):
 
 def test_standard_error_is_the_scatter_of_repeated_renders(tmp_path):
     with _mitsuba("llvm_ad_rgb"):
-        scene = _load(find("ball"), {}, 16, 9, True)
+        scene, _ = _load(find("ball"), {}, 16, 9, True)
         pictures, errors = [], []
         for first in range(24):
             passes = Passes(scene, 64)
@@ -95,3 +95,40 @@ def test_standard_error_is_the_scatter_of_repeated_renders(tmp_path):
             errors.append(passes.standard_error().pixels)
     ratio = np.std(pictures, axis=0, ddof=1).mean() / np.sqrt(np.mean(np.square(errors), axis=0)).mean()
     assert 0.85 < ratio < 1.15
+
+
+@pytest.mark.parametrize("scatter", [False, True])
+def test_passes_go_on_from_what_was_kept(scatter):
+    """At every pass another ``Passes`` takes over; the end is that of one that did all."""
+    whole = Passes(box(), 64, scatter=scatter)
+    for _ in whole.run(lambda fraction: None):
+        continue
+    done, seen = Passes(box(), 64, scatter=scatter), []
+    for _ in range(16):
+        next(done.run(seen.append))
+        other = Passes(box(), 64, scatter=scatter)
+        other.restore(done.state())
+        done = other
+    assert seen[-1] == 1.0 and seen == sorted(seen) and done.samples == whole.samples
+    assert np.allclose(done.picture().pixels, whole.picture().pixels, rtol=1e-6, atol=0.0)
+    if scatter:
+        assert np.allclose(done.standard_error().pixels, whole.standard_error().pixels, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"counts": np.array([0, 8, 0])},
+        {"counts": np.array([99, 8, 0])},
+        {"counts": np.array([1.0, 8.0, 0.0])},
+        {"channels": np.array(["R", "G", "B", "A", "A"])},
+        {"channels": np.array([1, 2, 3])},
+        {"sums": np.zeros((9, 16, 5))},
+        {"squares": np.zeros((2, 2))},
+    ],
+)
+def test_passes_do_not_go_on_from_anything_else(change):
+    passes = Passes(box(), 64)
+    next(passes.run(lambda fraction: None))
+    with pytest.raises(ValueError):
+        Passes(box(), 64).restore(passes.state() | change)

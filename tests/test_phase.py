@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import FLOAT64, PHASE_FLOAT32, PHASE_GRADIENT, PHASE_QUADRATURE
+from tolerances import FLOAT64, PHASE_FLOAT32, PHASE_GRADIENT, PHASE_QUADRATURE, PHASE_TABLE
 
+import atmo_jit
+from atmo_jit.backend import row_size, types
 from atmo_jit.errors import AtmosphereError
+from atmo_jit.optics import Optics, phase_node
 from atmo_jit.phase import (
     CornetteShanks,
     HenyeyGreenstein,
@@ -192,3 +195,17 @@ def test_refusals_name_the_field(description, field):
     with pytest.raises(AtmosphereError) as caught:
         phase_from_dict(description, 2)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("g", [-0.85, 0.0, 0.5, 0.85])
+def test_the_table_of_order_1_is_the_closed_form_between_its_nodes(g):
+    """As many moments as a peak of g = 0.85 has, interpolated as the light of order 1 does."""
+    phase = {"type": "henyey_greenstein", "g": g}
+    air = atmo_jit.Atmosphere.load("earth").replace({"rayleigh": None, "mie.phase": phase})
+    rows = Optics(air, np.arange(1)).phase_table(100).numpy()[:: row_size(1)]
+    theta = np.concatenate([np.linspace(0.0, 0.2, 4000), np.linspace(0.2, np.pi - 0.2, 4000)])
+    nu = np.cos(np.concatenate([theta, np.pi - theta[:4000]]))
+    place = phase_node(types().Float(nu)).numpy()
+    found = np.interp(place, np.arange(len(rows)), rows)
+    closed = (1.0 - g * g) / (4.0 * np.pi * (1.0 + g * g - 2.0 * g * nu) ** 1.5)
+    assert found == pytest.approx(closed, rel=PHASE_TABLE)

@@ -48,13 +48,25 @@ class Cells:
             v_x, v_y = at_right - v, at_below - v
             first.append(packed(v, at_both - at_below - v_x, TWIST_BITS))
             second.append(packed(v_x, v_y, SLOPE_BITS))
-        self._words = stored(first + second, lane, 2 * self._stored)
-        self.nbytes = 4 * dr.width(self._words)
+        self.words = stored(first + second, lane, 2 * self._stored)
+
+    @classmethod
+    def of(cls, words: Any, count: int, columns: int) -> Cells:
+        """The cells of ``count`` values that have these ``words``."""
+        cells = cls.__new__(cls)
+        cells.columns, cells.count, cells.words = columns, count, words
+        cells._stored = 1 << (count - 1).bit_length()
+        return cells
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the table."""
+        return 4 * dr.width(self.words)
 
     def at(self, row: Any, y: Any, column: Any, x: Any) -> list[Any]:
         """The N values at the fractions ``y``, ``x`` of the cell that begins at node ``row``, ``column`` (Ints)."""
         cell = types().UInt(dr.fma(row, self.columns, column))
-        words = packet(self._words, cell, 2 * self._stored)[: self._stored + self.count]
+        words = packet(self.words, cell, 2 * self._stored)[: self._stored + self.count]
         found = []
         for first, second in zip(words, words[self._stored :], strict=False):
             twist, slope = last_bits(first, TWIST_BITS), last_bits(second, SLOPE_BITS)

@@ -17,8 +17,8 @@ import numpy as np
 from ..backend import floats, packet, padded, parameter, types
 from ..mapping import Hillaire, texels
 from ..sky import RayLight, Sky
+from .node_light import is_peaked
 from .sightlines import Sightlines
-from .sky_view import channels_last, is_peaked
 from .sunlight import Sunlight
 
 SLICES = 32
@@ -143,20 +143,23 @@ class _Band:
         ray = dr.arange(t.UInt, views * slices)
         sun, beside = floats(np.full(views * slices, mu_s)), floats(np.tile(across, slices))
         nu = lines.nu(ray, sun, beside)
+        dr.eval(ray, sun, beside, nu)
         shape = (slices, views)
         single = lines.single(Sunlight(optics, band.columns), ray, sun, beside, nu)
         smooth = np.zeros((*shape, self.channels))
         if band.source is not None:
-            for light in lines.multiple(band.source, ray, sun, beside, nu):
-                smooth = smooth + channels_last(light, shape)
+            multiple = lines.multiple(band.source, ray, sun, beside, nu)
+            dr.eval(multiple)
+            for light in multiple:
+                smooth = smooth + _channels_last(light, shape)
         self.peaks, groups = [], []
         for k, light in zip(optics.scatterers, single, strict=True):
             if is_peaked(optics.constituents[k]):
                 self.peaks.append(k)
-                groups.append(channels_last(light, shape))
+                groups.append(_channels_last(light, shape))
             else:
                 values = zip(light, optics.phase_values(k, nu), strict=True)
-                smooth = smooth + channels_last([s * p for s, p in values], shape)
+                smooth = smooth + _channels_last([s * p for s, p in values], shape)
         through = lines.transmittance.reshape(*shape, -1)
         before = np.concatenate([np.ones((1, *through.shape[1:])), np.cumprod(through, axis=0)[:-1]])
         depth = np.cumsum(-np.log(np.maximum(through, 1e-38)), axis=0)
@@ -191,3 +194,9 @@ def _blend(read: Any, steps: tuple[int, ...], fractions: tuple[Any, ...], offset
         return read(offset)
     low, high = (_blend(read, steps[1:], fractions[1:], offset + o) for o in (0, steps[0]))
     return [dr.lerp(a, b, fractions[0]) for a, b in zip(low, high, strict=True)]
+
+
+def _channels_last(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Floats per channel as one float32 array [*shape, C]."""
+    dr.eval(values)
+    return np.stack([np.broadcast_to(v.numpy(), np.prod(shape)).reshape(shape) for v in values], axis=-1)

@@ -184,8 +184,9 @@ class Pieces:
 
 class Nodes:
     """Nodes in pieces, piece by piece. NumPy: ``ray`` [P]; ``distance`` [P, node] (m); ``first`` [R + 1]: pieces of
-    each ray. Dr.Jit, evaluated: ``first_node``, the same of nodes; ``table`` and ``densities``: Rays.at; ``columns``
-    from the start of the ray (per constituent) and ``length`` (weight) in double precision (m)."""
+    each ray. Dr.Jit, evaluated: ``ray_of_piece``, ``first_piece`` and ``first_node``, the same of pieces and of nodes;
+    ``table`` and ``densities``: Rays.at; ``place`` (distance), ``columns`` from the start of the ray (per constituent)
+    and ``length`` (weight) in double precision (m)."""
 
     def __init__(self, pieces: Pieces, seen: np.ndarray, count: int) -> None:
         t, self.rays = types(), pieces.rays
@@ -194,10 +195,12 @@ class Nodes:
         self.ray, near, step = pieces.ray[seen], pieces.near[seen], pieces.step[seen]
         self.distance = near[:, None] + step[:, None] * x
         self.first = np.searchsorted(self.ray, np.arange(len(rays.mu) + 1))
+        self.ray_of_piece, self.first_piece = uints(self.ray), uints(self.first)
         self.first_node = uints(self.first * count)
         if not len(self.ray):  # no ray meets air
             nothing = [t.Float64()] * len(pieces.density)
             self.length, self.columns, self.densities, self.table = t.Float64(), nothing, nothing, t.Float()
+            self.place = t.Float64()
             return
         lane = dr.arange(t.UInt, self.distance.size)
         piece = lane // count
@@ -216,9 +219,10 @@ class Nodes:
             dr.fma(step, sum(a * of_piece(d) for a, d in zip(running, density, strict=True)), of_piece(before))
             for density, before in zip(pieces.density[..., seen], pieces.from_start[:, seen], strict=True)
         ]
-        dr.schedule(self.length, self.columns)
-        ray, half = dr.gather(t.UInt, uints(self.ray), piece), (0.5 / count) * step
-        self.table, self.densities = rays.at(ray, dr.fma(step, of_node(x), of_piece(near)), half)
+        self.place = dr.fma(step, of_node(x), of_piece(near))
+        dr.schedule(self.length, self.columns, self.place)
+        ray, half = dr.gather(t.UInt, self.ray_of_piece, piece), (0.5 / count) * step
+        self.table, self.densities = rays.at(ray, self.place, half)
 
 
 def sums(values: np.ndarray, first: np.ndarray) -> np.ndarray:

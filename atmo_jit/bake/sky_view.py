@@ -8,72 +8,26 @@ Cells are those of :mod:`.cells`.
 A forward peak would need many cells. So each peaked scatterer has a channel of its own: its single scattering without
 phase function, the mean over the wavelengths. At look-up that is multiplied by the phase function and by the colour it
 has in the sun's own direction. What it then is wrong elsewhere is part of the other channels, which hold the total
-minus this product: exact at the nodes, and smooth, because the difference vanishes where the peak is.
+minus this product: exact at the nodes, and smooth, because the difference vanishes where the peak is. All this is made
+by :mod:`.node_light`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from .. import mapping
-from ..backend import floats, packet, padded, parameter, stored, types, uints
-from ..phase import Isotropic, RayleighPhase
+from ..backend import packet, padded, parameter, types
 from .cells import Cells
-from .mean_source import MeanSource, Series, view_cosines, view_range
-from .sightlines import Sightlines
-from .sunlight import Sunlight
+from .mean_source import view_cosines, view_range
+from .node_light import Baked, Nodes, light_at_nodes
 
 SIZE = (96, 80, 64)  # rows above the horizon, rows below, columns
-# Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
-DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 CROWDED = (0.1, 0.9)  # unit latitude below which rows crowd: of an observer some centimetres above the ground, far up
-SUNLIGHT = (96, 320)  # size of the table of sunlight: altitudes, sun cosines
 OFF_EDGE = 1e-4  # of the unit latitude: the first rows stand this far off the horizon
-
-
-@dataclass
-class Nodes:
-    """The table's nodes: altitude of the observer (m); unit latitude and cosine of the rows, and which of them look
-    above the horizon; cosines of the columns' azimuths and of the sun."""
-
-    h: float
-    x: np.ndarray
-    mu: np.ndarray
-    up: np.ndarray
-    cos_phi: np.ndarray
-    mu_s: float
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows, columns."""
-        return len(self.mu), len(self.cos_phi)
-
-    @property
-    def sun_row(self) -> int:
-        """The row above the horizon that is nearest to the sun's elevation."""
-        above = np.flatnonzero(self.up)
-        return int(above[np.argmin(np.abs(self.mu[above] - self.mu_s))])
-
-    @property
-    def nu(self) -> np.ndarray:
-        """Cosine of the angle to the sun, [rows, columns]."""
-        sines = np.sqrt((1.0 - self.mu) * (1.0 + self.mu)) * np.sqrt((1.0 - self.mu_s) * (1.0 + self.mu_s))
-        return np.clip(self.mu[:, None] * self.mu_s + sines[:, None] * self.cos_phi, -1.0, 1.0)
-
-
-@dataclass
-class NodeLight:
-    """Light at the nodes of a table, a Float [rows x columns] per channel: ``smooth`` without the single scattering of
-    peaked scatterers; ``peaks``: that, without phase functions, by index of the constituent; ``transmittance``: a Float
-    [rows] per channel."""
-
-    smooth: list[Any]
-    peaks: dict[int, list[Any]]
-    transmittance: list[Any]
 
 
 class SkyView:
@@ -117,8 +71,14 @@ class SkyView:
         self._start = (parameter(0.0), parameter((1.0 - flat) * (down_count - 1.0)))
         self._columns = parameter(columns - 1.0)
         self._mu_s, self._sin_s = parameter(np.cos(sun_zenith)), parameter(np.sin(sun_zenith))
-        light_at = source.light_at if hasattr(source, "light_at") else light_at_nodes
-        self._bands = [_Table(band.optics, nodes, light_at(band, nodes, ground), size) for band in source.bands]
+        if hasattr(source, "light_at"):
+            made = [
+                (band.optics, Baked.of(band.optics, nodes, source.light_at(band, nodes, ground)))
+                for band in source.bands
+            ]
+        else:
+            made = [(band.optics, light_at_nodes(band, nodes, ground)) for band in source.solutions]
+        self._bands = [_Table(*of_band, size) for of_band in made]
 
     def radiance(self, view_zenith: Any, azimuth: Any) -> list[Any]:
         """W Floats: radiance toward views at these angles (rad), ``azimuth`` from the sun's."""
@@ -167,27 +127,12 @@ class SkyView:
 class _Table:
     """One band's cells and the rows of its transmittance."""
 
-    def __init__(self, optics: Any, nodes: Nodes, light: NodeLight, size: tuple[int, int, int]) -> None:
-        self.phases = [optics.phase_function(k) for k in light.peaks]
+    def __init__(self, optics: Any, baked: Baked, size: tuple[int, int, int]) -> None:
+        self.phases = [optics.phase_function(k) for k in baked.peaks]
         self.channels = optics.channel_count
         self.up, self.down, columns = size
-        values, self.colours, greys = light.smooth, [], []
-        nu = floats(nodes.nu)
-        # Peaks taken apart, as the module says.
-        toward_sun = uints([nodes.sun_row * columns])
-        for phase, single in zip(self.phases, light.peaks.values(), strict=True):
-            grey = sum(single) / self.channels
-            in_sun = [dr.gather(types().Float, v, toward_sun) for v in single]
-            mean = dr.maximum(sum(in_sun) / self.channels, 1e-30)
-            colour = [v / mean for v in in_sun]
-            parts = zip(values, single, colour, phase(nu), strict=True)
-            values = [dr.fma(s - grey * shade, phase, v) for v, s, shade, phase in parts]
-            self.colours.append(colour)
-            greys.append(grey)
-        self.cells = Cells([*values, *greys], columns, (self.up, self.down))
-        lane = dr.arange(types().UInt, self.up + self.down)
-        self.rows = stored(light.transmittance, lane, padded(self.channels))
-        dr.eval(self.colours)
+        self.cells = Cells.of(baked.words, self.channels + len(baked.peaks), columns)
+        self.colours, self.rows = baked.colours, baked.transmittance
         self.nbytes = self.cells.nbytes + 4 * dr.width(self.rows)
 
     def _row(self, up: Any, row: Any) -> tuple[Any, Any]:
@@ -211,49 +156,3 @@ class _Table:
         after = dr.minimum(i + 1, dr.select(up, self.up, self.up + self.down) - 1)
         low, high = packet(self.rows, t.UInt(i), size), packet(self.rows, t.UInt(after), size)
         return [dr.lerp(a, b, f) for a, b in zip(low, high, strict=True)][: self.channels]
-
-
-def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> NodeLight:
-    """Light at the nodes from the solution itself, by :class:`Sightlines`: many suns are one here, many azimuths along
-    shared rays take their place."""
-    optics, shape = band.optics, nodes.shape
-    quadrature = DAY_NODES if nodes.mu_s > TWILIGHT else TWILIGHT_NODES
-    lines = Sightlines(optics, np.full(shape[0], nodes.h), nodes.mu, ground=~nodes.up, nodes=quadrature)
-    ray = uints(np.repeat(np.arange(shape[0]), shape[1]))
-    sin_s = np.sqrt((1.0 - nodes.mu_s) * (1.0 + nodes.mu_s))
-    sun, across = floats(np.full(shape, nodes.mu_s)), floats(np.broadcast_to(sin_s * nodes.cos_phi, shape))
-    nu = lines.nu(ray, sun, across)
-    smooth = [dr.zeros(types().Float, dr.width(ray)) for _ in range(optics.channel_count)]
-    if ground:  # only rows below the horizon meet it; they are the last
-        first = int(np.count_nonzero(nodes.up)) * shape[1]
-        below = dr.arange(types().UInt, first, dr.width(ray))
-        parts = (dr.gather(type(v), v, below) for v in (ray, sun, across))
-        for v, glow in zip(smooth, lines.ground_light(band, *parts), strict=True):
-            dr.scatter(v, glow, below)
-        dr.eval(smooth)
-    if band.source is not None:
-        whole = lines.scattering.reshape(1, *lines.scattering.shape)
-        source = MeanSource(band, np.array([nodes.mu_s]), np.array([nodes.h]))
-        series = Series(source.along(np.array([nodes.h]), nodes.x[None], nodes.up, whole)[0, :, 0])
-        more = series.at(ray, floats(np.broadcast_to(nodes.cos_phi, shape)))
-        smooth = [v + m for v, m in zip(smooth, more, strict=True)]
-    peaks = {}
-    singles = lines.single(Sunlight(optics, band.columns, SUNLIGHT), ray, sun, across, nu) if optics.scatterers else []
-    for k, single in zip(optics.scatterers, singles, strict=True):
-        if is_peaked(optics.constituents[k]):
-            peaks[k] = single
-        else:
-            values = zip(single, optics.phase_values(k, nu), smooth, strict=True)
-            smooth = [dr.fma(s, p, v) for s, p, v in values]
-    return NodeLight(smooth, peaks, [floats(c) for c in lines.transmittance.T])
-
-
-def is_peaked(constituent: Any) -> bool:
-    """Whether a scatterer's phase function is kept out of what is interpolated."""
-    return not isinstance(constituent.phase, RayleighPhase | Isotropic)
-
-
-def channels_last(values: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Floats per channel as one float32 array [*shape, C]."""
-    dr.eval(values)
-    return np.stack([np.broadcast_to(v.numpy(), np.prod(shape)).reshape(shape) for v in values], axis=-1)

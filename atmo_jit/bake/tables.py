@@ -19,14 +19,14 @@ import drjit as dr
 import numpy as np
 
 from .. import mapping
-from ..backend import floats, packet, padded, parameter, types
+from ..backend import floats, packet, padded, parameter, stored, types
 from ..mapping import texels
 from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
-from .mean_source import MeanSource, Series, view_cosines
+from .mean_source import MeanSource, view_cosines
+from .node_light import NodeLight, Nodes, is_peaked
 from .sightlines import Sightlines
-from .sky_view import NodeLight, Nodes, is_peaked
 from .sunlight import Sunlight
 
 OFF_EDGE = 1e-4  # of the unit elevation: rows stand this far off the horizon
@@ -123,7 +123,7 @@ class Tables4D:
         return NodeLight(
             smooth,
             dict(zip(kinds, peaks, strict=True)),
-            [dr.gather(t.Float, v, row) for v in through],
+            stored([dr.gather(t.Float, v, row) for v in through], dr.arange(t.UInt, rows), padded(len(through))),
         )
 
     @property
@@ -187,12 +187,12 @@ class _Band4D:
         cos_phi = 1.0 - 2.0 * t.Float(phi) / (azimuths - 1.0)
         across = dr.sqrt((1.0 - cosine) * (1.0 + cosine)) * cos_phi
         nu = lines.nu(ray, cosine, across)
+        dr.eval(ray, cosine, across, nu)
         single = lines.single(Sunlight(optics, self.band.columns), ray, cosine, across, nu)
         smooth = [dr.zeros(t.Float, dr.width(lane)) for _ in range(self.channels)]
         if self.band.source is not None:
-            whole = lines.scattering.reshape(len(h), rows, *lines.scattering.shape[1:])
             places = np.broadcast_to(x, (len(h), rows))
-            series = Series(MeanSource(self.band, mu_s).along(h, places, is_up, whole))
+            series = MeanSource(self.band, mu_s).along(h, places, is_up, lines.scattering_table)
             smooth = series.at(ray * suns + sun, cos_phi)
         for n, k in enumerate(optics.scatterers):
             if n not in self.peaks:

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from atmo_jit.errors import InputError
-from atmo_jit.files import atomic_outputs, check_output
+from atmo_jit.files import atomic_outputs, check_folder, check_output
 from atmo_jit.progress import progress_bar
 
 PARTS = ("frontier", "stages", "peers", "curves")
@@ -51,12 +51,14 @@ def command(
     for name in methods:
         method_of(name)
     Atmosphere.load(atmosphere)
-    made = not out.exists()
-    if made:
-        if not out.parent.is_dir():
-            raise InputError(f"--out {str(out)!r}: there is no folder {str(out.parent)!r}")
-    elif not out.is_dir():
-        raise InputError(f"--out {str(out)!r}: is not a folder; give the name of a new or an existing folder")
+    check_folder(out)
+    if not out.exists() and not out.parent.is_dir():
+        raise InputError(f"--out {str(out)!r}: there is no folder {str(out.parent)!r}")
+    drawn = find_spec("matplotlib") is not None
+    names = ["bench.json", "bench.md"] + ["bench.png"] * drawn
+    if out.exists():
+        for name in names:
+            check_output(out / name, Path(name).suffix)
     with progress_bar("measuring", quiet=quiet) as advance:
         result = frontier.measure(
             reference=reference,
@@ -67,12 +69,10 @@ def command(
             most_views=most_views,
             advance=advance,
         )
-    drawn = find_spec("matplotlib") is not None
     if not drawn:
         reason = "matplotlib is not installed: pip install 'atmo-jit[bench]'"
         result["skipped"].append({"what": "bench.png", "reason": reason})
     out.mkdir(exist_ok=True)
-    names = ["bench.json", "bench.md"] + ["bench.png"] * drawn
     with ExitStack() as stack:
         temporary = stack.enter_context(atomic_outputs(*(check_output(out / n, Path(n).suffix) for n in names)))
         temporary[0].write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -18,6 +18,7 @@ import numpy as np
 from ..backend import floats, types
 from ..errors import InputError
 from ..files import atomic_outputs
+from ..image import write_planes
 
 CHANNELS = ("R", "G", "B", "A")
 
@@ -93,8 +94,7 @@ def exr(name: str, texels: np.ndarray, header: dict[str, Any], *, flipped: bool 
 
         planes = {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate(CHANNELS[: image.shape[-1]])}
         fixed = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        with OpenEXR.File({**fixed, **header}, planes) as file:
-            file.write(str(path))
+        write_planes(path, {**fixed, **header}, planes)
 
     return File(name, image, write, read_exr)
 

@@ -25,7 +25,7 @@ def both(sky: Sky, altitude: float, sun_deg: float, nodes: int = 3) -> tuple[np.
         lines = Sightlines(band.optics, h, np.cos(zenith), nodes=nodes)
         ray, mu_s, across = uints(np.arange(len(h))), floats(np.cos(sun)), floats(np.sin(sun) * np.cos(azimuth))
         nu = lines.nu(ray, mu_s, across)
-        total = lines.ground_light(band, ray, mu_s, across)
+        total = lines.ground_light(band.columns, band.field, ray, mu_s, across)
         for k, light in zip(
             band.optics.scatterers,
             lines.single(Sunlight(band.optics, band.columns), ray, mu_s, across, nu),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -82,3 +84,29 @@ def test_png_has_the_srgb_curve(tmp_path):
     shown = np.array(mi.Bitmap(str(tmp_path / "x.png")))
     assert shown.dtype == np.uint8
     assert np.abs(shown.astype(int) - [[[0, 0, 0], [128, 188, 255]]]).max() <= 1
+
+
+def test_channels_come_back_as_they_were(tmp_path):
+    planes = {name: np.random.default_rng(1).random((5, 7), np.float32) for name in ("R", "G", "depth.Z")}
+    image.write_planes(tmp_path / "a.exr", {}, planes)
+    back = image.read_planes(tmp_path / "a.exr")
+    assert set(back) == set(planes) and all(np.array_equal(back[name], planes[name]) for name in planes)
+
+
+def test_damaged_pictures_are_an_exception_and_no_lines(tmp_path, capfd):
+    """And their size is known before memory is taken."""
+    image.write_planes(tmp_path / "a.exr", {}, {name: np.ones((8, 16), np.float32) for name in "RGB"})
+    good = (tmp_path / "a.exr").read_bytes()
+    start = good.index(b"dataWindow\0box2i\0") + 22
+    bad = tmp_path / "b.exr"
+    for content in (b"", good[:50], good[:-1], good[:-20], good[:-1] + b"\0" * 3, good[: start + 8] + b"\xff" * 8):
+        bad.write_bytes(content)
+        try:
+            planes = image.read_planes(bad)
+        except (OSError, RuntimeError, ValueError):
+            continue
+        assert all(plane.shape == (8, 16) for plane in planes.values())
+    bad.write_bytes(good[: start + 8] + struct.pack("<2i", 20_000, 200_000) + good[start + 16 :])
+    with pytest.raises(ValueError, match="would take more than 2147483648 bytes"):
+        image.read_planes(bad)
+    assert capfd.readouterr() == ("", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import subprocess
 import sys
 import zipfile
@@ -11,7 +12,12 @@ from random import Random
 import numpy as np
 import pytest
 
-from bench.hostile import _hostile_npz, _npz, damaged, feed, targets
+from atmo_jit.cli import main
+from atmo_jit.errors import InputError
+from atmo_jit.fits import load_observations
+from bench.damage import damaged, hostile_npz, npz
+from bench.hostile import feed
+from bench.hostile_targets import SCENE, targets
 
 LIMITED = """
 import resource, sys
@@ -34,13 +40,13 @@ def test_many_of_the_files():
 def test_a_good_file_is_damaged(tmp_path):
     """The fuzzer does what it says: few of its files are still good."""
     for target in targets(tmp_path):
-        bad = {damaged(Random(i), target, tmp_path / "mark") for i in range(30)}
+        bad = {damaged(Random(i), target.name, target.content, str(tmp_path / "mark")) for i in range(30)}
         assert len(bad - {target.content}) > 15
 
 
 def test_a_bomb_takes_no_memory(tmp_path):
     """A packed array of 4 GiB, of which half a GiB is there, and another bad file, in a process that may have 3 GiB."""
-    good = _npz({name: np.zeros(6) for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")})
+    good = npz({name: np.zeros(6) for name in ("altitude_m", "sun_zenith_deg", "view_zenith_deg", "azimuth_deg")})
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("altitude_m.npy", "w", force_zip64=True) as member:
@@ -49,7 +55,7 @@ def test_a_bomb_takes_no_memory(tmp_path):
             )
             for _ in range(1 << 5):
                 member.write(b"\0" * (1 << 24))
-    for i, content in enumerate([stream.getvalue(), _hostile_npz(Random(0), good, tmp_path / "mark")]):
+    for i, content in enumerate([stream.getvalue(), hostile_npz(Random(0), good, str(tmp_path / "mark"))]):
         (tmp_path / f"{i}.npz").write_bytes(content)
         done = subprocess.run(
             [sys.executable, "-c", LIMITED, "sky", "--atmosphere", "earth", "--views", f"{i}.npz", "--out", "o.npz"],
@@ -61,3 +67,39 @@ def test_a_bomb_takes_no_memory(tmp_path):
         assert done.returncode in (0, 2), done.stderr
         assert i or (done.returncode == 2 and done.stderr.count("\n") == 1)
     assert not (tmp_path / "mark").exists()
+
+
+@pytest.mark.parametrize("name", ["9" * 5000, "a\0b", "x" * 300 + ".json"])
+def test_names_that_no_file_system_takes(name, tmp_path, capsys):
+    """Wherever a file may be named: one line."""
+    np.savez(tmp_path / "views.npz", altitude_m=0.0)
+    (tmp_path / "fit.toml").write_text(f"atmosphere = {json.dumps(name)}\n[free]\nground_albedo = {{}}\n")
+    (tmp_path / "scene.json").write_text(json.dumps(SCENE | {"sky": {"type": "atmosphere", "atmosphere": name}}))
+    views, config, scene = (str(tmp_path / file) for file in ("views.npz", "fit.toml", "scene.json"))
+    for arguments in (
+        ["sky", "--atmosphere", name, "--views", views, "--out", str(tmp_path / "o.npz")],
+        ["sky", "--atmosphere", "earth", "--views", name, "--out", str(tmp_path / "o.npz")],
+        ["sky", "--atmosphere", "earth", "--views", views, "--out", f"{name}.npz"],
+        ["fit", "--observations", views, "--config", config, "--out", str(tmp_path / "o.json")],
+        ["render", scene, "--out", str(tmp_path / "o.exr")],
+        ["render", f"{name}.xml", "--out", str(tmp_path / "o.exr")],
+        ["plan", name],
+        ["export", "--atmosphere", "earth", "--layout", "native", "--out", name * 2],
+        ["bench", "--out", name * 2, "--quick"],
+    ):
+        if "\0" in "".join(arguments):  # files can hold what no command line can
+            continue
+        assert main(arguments) == 2, arguments
+        said = capsys.readouterr().err
+        assert said.startswith("atmo-jit: ") and said.count("\n") == 1 and len(said) < 2000, said
+    assert {path.name for path in tmp_path.iterdir()} == {"views.npz", "fit.toml", "scene.json"}
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [('0,"40', "a quote without an end"), ("0," + "9" * 200_000, "is not CSV"), ("0,4e1,3", "line 2 has 3 values")],
+)
+def test_rows_that_are_none(row, text, tmp_path):
+    (tmp_path / "scan.csv").write_text(f"altitude_m,radiance\n{row}\n0,1\n")
+    with pytest.raises(InputError, match=text):
+        load_observations(tmp_path / "scan.csv")

@@ -1,0 +1,54 @@
+"""Atmospheres of bench.stress in which light was wrong, and what was: each against the twin, in double precision."""
+
+from __future__ import annotations
+
+from random import Random
+
+import numpy as np
+import pytest
+from twins import Twin
+
+import atmo_jit
+from atmo_jit.backend import doubles
+from bench.extremes import extreme_views, extreme_world
+from bench.stress import PER_WORLD, Solved, check_derivatives, of_twin
+from bench.worlds import world
+
+# Quantity, and the worst that single precision is allowed there.
+LIMITS = {"transmittance, twin": 1e-3, "sun irradiance, twin": 5e-4, "single scattering, twin": 1e-2}
+
+
+# 38: air 205 m deep under a top 35,000 km up, which no ray was cut for. 161, 3031: the sun sets between two nodes of a
+# ray. 184: the sun seen from 56 m under a step of density 56,000 km up.
+@pytest.mark.parametrize("number", [38, 161, 184, 3031])
+def test_light_is_that_of_the_twin(number):
+    rng = Random(number)
+    air = extreme_world(rng)
+    views = extreme_views(rng, air, PER_WORLD)
+    solved = Solved(air)
+    errors = of_twin(air, views, [*solved.rays(views), *solved.irradiances(views)], Twin(air))
+    worst = {name: float(np.max(values, initial=0.0)) for name, values in errors.items()}
+    assert {name: worst[name] for name, limit in LIMITS.items() if worst.get(name, 0.0) > limit} == {}
+
+
+def test_rays_beside_the_horizon_know_on_which_side_they_are():
+    air = world(bottom_radius_m=5e6, top_radius_m=2e7, sun_angular_radius_deg=0.0)
+    twin, radius = Twin(air), 5e6
+    h = np.repeat(np.geomspace(1e-3, 1e7, 11), 2)
+    horizon = 0.5 * np.pi + np.arctan2(np.sqrt(h * (2.0 * radius + h)), radius)
+    zenith = horizon + np.tile([-1e-7, 1e-7], 11)
+    sky = atmo_jit.Sky(air, 1)
+    rays, *_ = sky.enter(*(doubles(v) for v in (h, np.zeros(22), zenith, np.zeros(22))))
+    assert rays.ground.numpy().tolist() == [False, True] * 11 == twin.hits_ground(h, np.cos(zenith)).tolist()
+    through = sky.rays(h, np.zeros(22), zenith, np.zeros(22)).transmittance
+    want = np.exp(-twin.optical_depth(twin.columns(h, np.cos(zenith), 0.0, twin.limits(h, np.cos(zenith))[1])))
+    assert np.stack([t.numpy() for t in through], axis=1) == pytest.approx(want, abs=2e-4)
+
+
+# 0: rays without end, whose end was moved by infinity. 1: 92 scale heights of air, of which the topmost scatter 1e-40.
+@pytest.mark.parametrize("number", [0, 1])
+def test_derivatives_are_finite(number):
+    rng = Random(number)
+    air = extreme_world(rng, widths=(1, 1, 3))
+    errors = check_derivatives(rng, air, extreme_views(rng, air, 50), 4)
+    assert errors["derivatives not finite"].sum() == 0.0 and errors["adjoint identity"] < 1e-5
