@@ -71,8 +71,8 @@ class AtmospherePath:
 
      * - orders
        - |int|
-       - How often light is scattered in the air or reflected by the planet's ground, at most. Between 3 and no limit
-         more is taken away among shapes than they hide: the field behind them has orders of its own. (Default: no limit)
+       - How often light is scattered in the air or reflected by the planet's ground, at most. With 3 or
+         more, but a limit, shapes take away too much: the field behind them has orders of its own. (Default: no limit)
 
      * - shaft_samples
        - |int|
