@@ -109,6 +109,8 @@ class Resolution:
             first_degree=first,
             # Two levels leave 3 % of the light that twilight brings to the ground of a small planet.
             beam_refine=(2, 3, 3, 3)[level],
+            # Between rows a column is linear in the root of the depth below a break, which derivatives by profiles see.
+            columns=(384, 192) if fine else (128, 96),
             # As many as the azimuths tell apart when what they see is projected on the first ones.
             phase_degree=max(16, first + 8),
         )

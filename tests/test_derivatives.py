@@ -15,6 +15,7 @@ from tolerances import (
     NODES_MOVED,
     VIEW_MOVED,
 )
+from twins import Twin, cosines
 
 import atmo_jit
 from atmo_jit.backend import types
@@ -157,6 +158,47 @@ def test_derivatives_are_those_of_monte_carlo(reference, fine):
     for row in rows:
         by_g = row["name"] == "mie.phase.g"
         assert row["logarithmic"] < (DERIVATIVE_BY_G if by_g else DERIVATIVE_BY_COEFFICIENT)[fine], row
+
+
+STEPS = {
+    "mie.scattering_per_m": 1e-3,
+    "rayleigh.scattering_per_m": 1e-3,
+    "mie.single_scattering_albedo": 1e-3,
+    "mie.phase.g": 1e-3,
+    "ozone.absorption_per_m": 1e-2,
+    "ground_albedo": 1e-2,
+    "rayleigh.scale_height_m": 1e-3,
+    "mie.scale_height_m": 1e-3,
+    "ozone.center_m": 1e-3,
+    "ozone.half_width_m": 1e-3,
+    "sun_angular_radius_deg": 1e-2,
+    "altitude_m": 1.0,
+    "sun_zenith_deg": 0.01,
+    "view_zenith_deg": 0.01,
+    "azimuth_deg": 0.01,
+}
+
+
+def test_derivatives_of_order_1_are_those_of_double_precision():
+    """By many kinds of parameters, against differences of the twin, which knows no tables."""
+    views = {**VIEWPOINTS, "altitude_m": np.array([2.0, 10.0, 3e3, 2e4, 5e4, 2.0])}
+    angles = ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")
+
+    def light(air, views):
+        twin, cosine = Twin(air.to_dict()), cosines(*(views[name] for name in angles))
+        return sum(of(views["altitude_m"], *cosine) for of in (twin.single_scattering, twin.ground_direct))
+
+    at = Linearization(EARTH, views, orders=1, fine=True)
+    by = at.jacobian(list(STEPS))
+    for name, step in STEPS.items():
+        ends, scale = [], 1.0 if name in VIEWS else described(EARTH, name)
+        for sign in (1, -1):
+            if name in VIEWS:
+                ends.append(light(EARTH, views | {name: views[name] + sign * step}))
+            else:
+                ends.append(light(EARTH.replace({name: (np.asarray(scale) * (1.0 + sign * step)).tolist()}), views))
+        want = (ends[0] - ends[1]) / (2.0 * step)
+        assert np.abs(by[name] * scale - want).max() < DIFFERENCES * np.abs(want).max(), name
 
 
 def test_derivatives_are_finite_where_pieces_scatter_next_to_nothing():
