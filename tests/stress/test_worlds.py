@@ -67,3 +67,9 @@ def test_derivatives_are_finite(number):
     air = extreme_world(rng, widths=(1, 1, 3))
     errors = check_derivatives(rng, air, extreme_views(rng, air, 50), 4)
     assert errors["derivatives not finite"].sum() == 0.0 and errors["adjoint identity"] < 1e-5
+
+
+def test_orders_of_a_sharp_peak_shrink():
+    """48: fog with g = 0.99. Radiance that swings below 0 beside its peak grew fourfold with every order."""
+    sky = atmo_jit.Sky(extreme_world(Random(48)))
+    assert max(len(band.field.shares) for band in sky.solutions) < 50
