@@ -50,6 +50,9 @@ class Linearization:
     """The sky of an atmosphere for a list of views, and its derivatives there.
 
     ``value``: what sky returns, by name: radiance, transmittance, sun_irradiance, sky_irradiance, float32 [N, W].
+    ``fine``: solved so finely that derivatives are as exact as the light is without it, at several times the cost
+    (docs/method.md has figures); without it those by an aerosol, near the horizon or where they are small, are some per
+    cent off, which is enough for a fit. ``resolution`` goes before it.
     """
 
     def __init__(
@@ -63,13 +66,16 @@ class Linearization:
         sun_disc: bool = False,
         resolution: Resolution | None = None,
         layout: Atmosphere | None = None,
+        fine: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
+        self._fine = fine
         self.views = check_views(views)
         self._options = {"ground": ground, "sun_disc": sun_disc}
         self._solving = {"orders": orders, "tolerance": tolerance}
         too = [c.name for c in self.atmosphere.constituents]
-        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, layout=layout, sure=True, scattering_too=too)
+        finer = {"sure": True, "fine": fine, "scattering_too": too}
+        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, layout=layout, **finer)
         r = self.sky.resolution
         self._degrees, self._phase_degree = r.degrees, r.phase_degree
 
@@ -79,9 +85,9 @@ class Linearization:
         On the same nodes as long as they suit, so that it changes smoothly with the parameters, as a fit wants it.
         Raises what Linearization raises, and InputError for an unknown name.
         """
-        options: dict[str, Any] = {**self._solving, **self._options}
+        options: dict[str, Any] = {**self._solving, **self._options, "fine": self._fine}
         there, views = replaced(self.atmosphere, self.views, parameters)
-        needed = Resolution.suited(there, options["tolerance"])
+        needed = Resolution.suited(there, options["tolerance"], fine=self._fine)
         if needed.first_degree <= self.sky.resolution.first_degree and Grid.suits(self.sky.layout, there):
             options |= {"resolution": self.sky.resolution, "layout": self.sky.layout}
         return Linearization(there, views, **options)

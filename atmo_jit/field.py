@@ -17,7 +17,7 @@ import numpy as np
 from .backend import evaluated, floats, packet, padded, row, stored, types, uints
 from .column import SunColumns
 from .geometry import safe_sine
-from .grid import Grid, split
+from .grid import Grid
 from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
 from .paths import lagrange
@@ -89,6 +89,7 @@ class Field:
 
     def prepare(self) -> None:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
+        self.grid.prepare()
         if self.scatters and self.optics.scatterers:
             dr.eval(self._tables)
         dr.eval(self._irradiances, self._guide)
@@ -130,12 +131,10 @@ class Field:
     def corners(self, h: Any, mu_s: Any, active: Any) -> tuple[list[Any], list[Any], list[list[Any]]]:
         """The four nodes about (h, mu_s), their weights, and the reference at the sun angle per altitude
         [2][channel]."""
-        suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
         x = self.grid.sun_position(mu_s)
-        s, fs = split(x * float(self.grid.sun_refine), suns)
-        first = k * suns + s
-        nodes = [first, first + 1, first + suns, first + suns + 1]
+        s, fs = self.grid.locate_source(x)
+        nodes = [self.grid.node(level, sun) for level in (k, k + 1) for sun in (s, s + 1)]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
         return nodes, weights, [self.reference.at(level, x, active, self._guide) for level in (k, k + 1)]
 
@@ -147,15 +146,14 @@ class Field:
         channels, size = range(self.optics.channel_count), padded(self.optics.channel_count)
         if not self.optics.scatterers:
             return [0.0 * h for _ in channels]
-        suns = self.grid.sources
         k, fk = self.grid.locate_altitude(h)
         x = self.grid.sun_position(mu_s)
-        s, fs = split(x * float(self.grid.sun_refine), suns)
+        s, fs = self.grid.locate_source(x)
         buffer = self._irradiances[int(reflected)]
         logs = []
         for level in (k, k + 1):
             guide = self.reference.at(level, x, active, self._guide)
-            values = [packet(buffer, level * suns + s + i, size, active) for i in (0, 1)]
+            values = [packet(buffer, self.grid.node(level, s + i), size, active) for i in (0, 1)]
             logs.append(
                 # Deep in the shadow the product of both leaves single precision.
                 [dr.log(dr.maximum(guide[c] * dr.lerp(values[0][c], values[1][c], fs), 1e-37)) for c in channels]

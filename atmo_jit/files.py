@@ -37,6 +37,15 @@ KINDS = "biuf"
 _TEMPORARY = re.compile(r"\.atmo-jit-(?P<host>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}(\.\w*)?")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file of that name; there is none of a name that the file system refuses (too long, a null
+    character)."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
     """``path`` as the name of a file that can be written, its links resolved.
 

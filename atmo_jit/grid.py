@@ -162,9 +162,18 @@ class Grid(Keeper):
     def _position(self, h: np.ndarray) -> np.ndarray:
         return np.sqrt(np.clip(h / self.thickness_m, 0.0, 1.0)) * _FINE
 
+    def prepare(self) -> None:
+        """Make the tables for look-ups, which cannot be made while a kernel is traced."""
+        dr.eval(self._u_buffer, self._sun_map, self._counts)
+
     @cached_property
     def _u_buffer(self) -> Any:
         return floats(self._u)
+
+    @cached_property
+    def _counts(self) -> tuple[Any, Any]:
+        """Of levels and of refined suns, which kernels read from memory: they serve grids of other sizes too."""
+        return dr.opaque(types().UInt, self.level_count, 1), dr.opaque(types().UInt, self.sources, 1)
 
     def locate_altitude(self, h: Any) -> tuple[Any, Any]:
         """Index of the level below altitude ``h`` and the fraction of the way to the next."""
@@ -175,7 +184,7 @@ class Grid(Keeper):
         position = dr.sqrt(share + dr.detach(dr.maximum(lowest - share, 0.0))) * _FINE
         cell = dr.minimum(t.UInt(position), _FINE - 1)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self.level_count)
+        return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self._counts[0])
 
     @cached_property
     def _sun_map(self) -> list[Any]:
@@ -190,7 +199,15 @@ class Grid(Keeper):
 
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
         """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
-        return split(self.sun_position(mu_s) * float(self.sun_refine), self.sources)
+        return self.locate_source(self.sun_position(mu_s))
+
+    def locate_source(self, x: Any) -> tuple[Any, Any]:
+        """The same by the sun coordinate ``x``."""
+        return split(x * float(self.sun_refine), self._counts[1])
+
+    def node(self, level: Any, source: Any) -> Any:
+        """Index of a level's node under a refined sun."""
+        return level * self._counts[1] + source
 
 
 def arrays_in(*things: Any) -> list[Any]:
@@ -230,10 +247,10 @@ def profile_key(profile: Any) -> Any:
     return profile
 
 
-def split(position: Any, count: int) -> tuple[Any, Any]:
-    """Index of the node before a position, and the fraction of the way to the next."""
+def split(position: Any, count: Any) -> tuple[Any, Any]:
+    """Index of the node before a position, of ``count`` (a UInt), and the fraction of the way to the next."""
     t = types()
-    index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), dr.opaque(t.UInt, count - 2, 1))
+    index = dr.minimum(t.UInt(dr.maximum(position, 0.0)), count - 2)
     return index, position - t.Float(index)
 
 

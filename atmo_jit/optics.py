@@ -262,7 +262,8 @@ class Optics:
                 kinks.update(_ramp_levels(c.profile, extinction, radius))
                 kinks.update(self._under_steps(c))
         levels += kinks
-        levels = np.unique(np.clip(levels, 0.0, top))
+        # Not np.unique: in its first call it imports all of numpy.ma.
+        levels = np.array(sorted(set(np.clip(levels, 0.0, top).tolist())))
         # A scale-height level beside another break only costs time; kinks stay. How near is near depends on the level
         # alone: under a top a hundred thousand scale heights up the air at the ground is as steep as under a low one.
         kept = [0.0]

@@ -27,11 +27,15 @@ class Recordings:
         self._recorded: dict[Any, Callable[..., Any]] = {}
         self._used: set[Any] = set()
 
-    def run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What ``function`` returns; ``key`` tells functions apart."""
+    def run(self, key: Any, function: Callable[..., Any], *arguments: Any, prepare: Any = None) -> Any:
+        """What ``function`` returns; ``key`` tells functions apart. ``prepare``: the part of the function that makes
+        what is kept, called in place of the first, plain call: kernels differ where they are recorded, and those of the
+        rest are then compiled once."""
         if key not in self._used:
             self._used.add(key)
-            return function(*arguments)
+            if prepare is None:
+                return function(*arguments)
+            prepare(*arguments)
         if key not in self._recorded:
             arrays = arrays_in(self._keepers)
             self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)

@@ -88,7 +88,8 @@ class Reference:
 
     def at(self, level: Any, x: Any, active: Any = True, fine: Any = None) -> list[Any]:
         """The reference at a level and a sun coordinate, per channel; ``fine``: at other levels than the grid's."""
-        t, suns = types(), FINE * (self.grid.shape[1] - 1) + 1
+        t, count = types(), FINE * (self.grid.shape[1] - 1) + 1
+        suns = self.grid.kept("suns of the reference", lambda: dr.opaque(t.UInt, count, 1))  # see Grid.node
         held = self.fine if fine is None else fine
         x = x * float(FINE)
         s = dr.minimum(t.UInt(x), suns - 2)

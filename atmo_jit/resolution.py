@@ -5,7 +5,7 @@ The rules are measured, not derived: `python -m bench.accuracy` prints what they
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,8 +15,10 @@ from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
 MOST_ALTITUDES = 48
-FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24)  # few, so that compiled kernels are shared between atmospheres
+# Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
+FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
+FINE_DEGREES, FINE_ALTITUDES = 4, 4  # more for derivatives that are to be as exact as the light
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -72,11 +74,13 @@ class Resolution:
         return tuple(sorted({self.first_degree, self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
 
     @classmethod
-    def suited(cls, atmosphere: Atmosphere, tolerance: float) -> Resolution:
+    def suited(cls, atmosphere: Atmosphere, tolerance: float, *, fine: bool = False) -> Resolution:
         """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
 
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
-        particles scatter.
+        particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l is l g^(l - 1),
+        which fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
+        orders have all degrees, but azimuthal orders as before.
         """
         first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
         later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
@@ -87,18 +91,26 @@ class Resolution:
         first = next(degree for degree in FIRST_DEGREES if degree >= first)
         stages = [_stage(later), _stage((3 * later) // 4)]
         level = int(np.searchsorted(-np.array(FINER), -tolerance))
+        altitudes = (8, 10, 12, 16)[level]
+        if fine:
+            first = next((degree for degree in FIRST_DEGREES if degree >= first + FINE_DEGREES), FIRST_DEGREES[-1])
+            up = max(10, 2 * first // 3)
+            stages = [replace(stages[0], degree=first, up=up, down=up - 2)]
+            altitudes += FINE_ALTITUDES
         return cls(
-            altitudes=_altitudes(atmosphere, (8, 10, 12, 16)[level], 16.0 if thick else 8.0),
+            altitudes=_altitudes(atmosphere, altitudes, 16.0 if thick else 8.0),
             suns=(21, 25, 29, 33)[level],
             first_suns=(1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
-            stages=tuple(stages if stages[0] != stages[1] else stages[:1]),
+            stages=tuple(dict.fromkeys(stages)),
             first_up=max(10, first),
             first_down=max(8, first - 2),
             first_azimuths=first + 4,
             first_degree=first,
             # Two levels leave 3 % of the light that twilight brings to the ground of a small planet.
             beam_refine=(2, 3, 3, 3)[level],
+            # Between rows a column is linear in the root of the depth below a break, which derivatives by profiles see.
+            columns=(384, 192) if fine else (128, 96),
             # As many as the azimuths tell apart when what they see is projected on the first ones.
             phase_degree=max(16, first + 8),
         )

@@ -76,7 +76,8 @@ class Sky:
     be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
     used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
     :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
-    orders are solved, for derivatives (SURE). Raises AtmosphereError, LLVMError, InputError.
+    orders are solved, for derivatives (SURE); ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
+    InputError.
     """
 
     @one_at_a_time
@@ -92,6 +93,7 @@ class Sky:
         *,
         scattering_too: Collection[str] = (),
         sure: bool = False,
+        fine: bool = False,
     ) -> None:
         self.atmosphere = Atmosphere.load(atmosphere)
         self.layout = layout or self.atmosphere
@@ -100,7 +102,7 @@ class Sky:
         if not 0.0 < tolerance < 1.0:
             raise InputError(f"tolerance: is {tolerance!r}; must be a number between 0 and 1")
         self.orders, self.tolerance, self.suns = orders, tolerance, suns
-        self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance)
+        self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance, fine=fine)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
         remainder = SURE * tolerance if sure else tolerance
@@ -343,7 +345,8 @@ def sky(
     ``tolerance``). ``ground=False`` leaves out the ground's own radiance, ``sun_disc=True`` adds the sun's.
     ``method``: "march" integrates every ray, "tables" interpolates them where a table serves, "auto" takes tables where
     they pay and keep the tolerance. ``gradient``: names of parameters by which the radiance is differentiated
-    (parameters.parameter_names has them all). ``progress`` is called with the fraction done.
+    (parameters.parameter_names has them all), on finer nodes (``fine`` of derivatives.Linearization). ``progress`` is
+    called with the fraction done.
 
     Raises InputError for views, orders, tolerance, method or names that are not allowed, AtmosphereError for a bad
     atmosphere, LLVMError without a usable LLVM.
@@ -373,7 +376,7 @@ def sky(
         from .derivatives import Linearization  # builds on this module
 
         options = {"tolerance": tolerance, "orders": orders, "ground": ground, "sun_disc": sun_disc}
-        derivatives = Linearization(air, checked, **options).gradients(names)
+        derivatives = Linearization(air, checked, fine=True, **options).gradients(names)
     meta = {
         "atmo_jit": __version__,
         "seconds": time.perf_counter() - start,

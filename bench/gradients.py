@@ -28,6 +28,7 @@ ROWS = {
     "reverse values": "reverse, all coefficients, g, albedos, solar irradiance",
     "reverse shape": "reverse, these and all profiles",
     "reverse all": "reverse, these and all of the views",
+    "fine values": "reverse, all coefficients, g, albedos, solar irradiance, with `fine`",
 }
 
 
@@ -64,7 +65,7 @@ def measure(row: str, views: int, tolerance: float) -> dict[str, float]:
                 angles = [doubles(np.radians(where[name])) for name in OF_VIEWS[1:]]
                 dr.eval(sky.rays(doubles(where["altitude_m"]), *angles).radiance)
         else:
-            at = Linearization(another(), where, tolerance=tolerance)
+            at = Linearization(another(), where, tolerance=tolerance, fine=kind == "fine")
             if kind == "forward":
                 at.jacobian({"1": VALUES[:1], "4": VALUES, "profile": PROFILES[:1]}[what])
             else:

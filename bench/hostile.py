@@ -22,7 +22,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from .counted import main
+from .counted import command
 from .damage import damaged
 from .hostile_targets import Target, targets
 
@@ -99,5 +99,7 @@ def _files(folder: Path) -> set[str]:
     return {os.path.join(root, name) for root, _, names in os.walk(folder) for name in names}
 
 
+main = command("bench.hostile", __doc__, "files", 500, feed)
+
 if __name__ == "__main__":
-    sys.exit(main("bench.hostile", __doc__, "files", 500, feed))
+    sys.exit(main())

@@ -28,7 +28,7 @@ import numpy as np
 from atmo_jit.export.containers import read_exr
 from atmo_jit.files import read_npz
 
-from .counted import main
+from .counted import command
 from .hostile_targets import CONFIG
 
 OLD = b"old"
@@ -198,5 +198,7 @@ def _resumed(work: Work) -> list[str]:
     return work.broken()
 
 
+main = command("bench.kills", __doc__, "kills", 50, lambda count, seed, advance: kill(count, seed, advance=advance))
+
 if __name__ == "__main__":
-    sys.exit(main("bench.kills", __doc__, "kills", 50, lambda count, seed, advance: kill(count, seed, advance=advance)))
+    sys.exit(main())

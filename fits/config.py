@@ -26,6 +26,7 @@ from typing import Any
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import InputError, shown
+from atmo_jit.files import is_file
 
 KEYS = ("atmosphere", "residual", "robust", "tolerance", "optimiser", "fixed", "free", "nuisance", "picture")
 FREE_KEYS = ("mode", "start", "min", "max", "prior", "prior_sigma", "exponent")
@@ -53,7 +54,7 @@ class FitConfig:
         """The configuration of a parsed file. Raises InputError naming the key, the value and what is allowed."""
         _known(document, KEYS, where)
         source = document.get("atmosphere", "earth")
-        if isinstance(source, str) and folder is not None and (folder / source).is_file():
+        if isinstance(source, str) and folder is not None and is_file(folder / source):
             source = folder / source
         atmosphere = Atmosphere.load(source)
         fixed = _table(document, "fixed", where)

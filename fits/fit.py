@@ -18,21 +18,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from atmo_jit.errors import InputError
-from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
-from .forward import ROUGH
 from .kept import Point, Report
 from .observations import Observations
 from .optimise import MAX_ITERATIONS, STEP_TOLERANCE, Residuals, Solution, minimise, steps_ahead
 from .problem import HUBER, Evaluation, Problem, without_darkness
+from .starts import check_count, check_units, few_of, fits, starting_points
 from .uncertainty import Uncertainty, uncertainty
 
-FEW = 128  # samples (directions) that the first steps look at, or
-FEW_EACH = 32  # of each scan, or
-FEW_FOLD = 8  # as many times the unknowns, whichever is most
-UNIT_FACTOR = 30.0  # between data and sky at the start, from which on the units are suspected
 POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 ROUNDS = 12  # of loss and weights, each of
@@ -91,16 +86,16 @@ def fit(
     everything, data = data, data.part(np.flatnonzero(data.used.any(axis=1)))
     samples = int(np.count_nonzero(data.used))
     whole = Problem.of(replace(config, atmosphere=air), data)
-    _check_count(whole, samples)
-    few = _few(whole)
+    check_count(whole, samples)
+    few = few_of(whole)
     if config.optimiser == "levenberg_marquardt":
         for problem in (few, whole):
             steps_ahead(len(problem.scalars))
     if begun is None:
         few.model.place(few.atmosphere_values(few.start))
-        _check_units(few)
+        check_units(few)
         begun = Point(0, (), tuple(few.start), tuple(few.start))
-    elif not _fits(begun, few, whole):
+    elif not fits(begun, few, whole):
         raise InputError("begun: is a point of another fit")
     report = Report(progress, keep, begun, started)
     if begun.step == 0:
@@ -123,13 +118,6 @@ def fit(
     return Fit(problem, u, found, errors, solution, starts, seconds, int(before - samples), unseen)
 
 
-def _fits(point: Point, few: Problem, whole: Problem) -> bool:
-    """Whether the numbers of unknowns are those of the problem."""
-    here = len(whole.scalars) if point.step else len(few.scalars)
-    counts = {len(point.nodes) - here, len(point.u) - here, *(len(end) - len(few.scalars) for end in point.ends)}
-    return counts == {0} and (len(point.ends) > 0 if point.step else len(point.ends) < len(_starting_points(few)))
-
-
 @dataclass(frozen=True)
 class _End:
     """Where a minimisation ended, and of what."""
@@ -148,7 +136,7 @@ def _search(few: Problem, whole: Problem, report: Report) -> None:
     other starts; as the point from which all samples are looked at."""
     few.model.place(few.atmosphere_values(np.array(report.point.nodes)))
     ends = [np.array(end) for end in report.point.ends]
-    for start in [np.array(report.point.u), *_starting_points(few)[len(ends) + 1 :]]:
+    for start in [np.array(report.point.u), *starting_points(few)[len(ends) + 1 :]]:
         report.reached(ends=ends, u=start)
         end = _minimum(few, start, report)
         ends.append(end.solution.u)
@@ -259,62 +247,3 @@ def _poor(end: _End) -> bool:
     measured = data.radiance[data.used]
     relative = float(np.median(np.abs(found.predicted[data.used] - measured) / np.maximum(np.abs(measured), 1e-30)))
     return _scale(found.raw[data.used]) > POOR and relative > POOR_LOG
-
-
-def _starting_points(whole: Problem) -> list[np.ndarray]:
-    """The start, then logarithmic scalars ten times larger and smaller and the others in the middle of their ranges."""
-    points = [whole.start]
-    for factor in (10.0, 0.1, 1.0):
-        middle = [
-            s.inner(s.start * factor) if s.logarithmic and not s.nuisance else 0.0 if s.bounded else s.inner(s.start)
-            for s in whole.scalars
-        ]
-        points.append(np.array(middle))
-    return points
-
-
-def _few(whole: Problem) -> Problem:
-    """The problem for some directions, and as many wavelengths as are solved at once."""
-    rows = _some(whole.data, max(FEW, FEW_EACH * whole.data.scans, FEW_FOLD * len(whole.scalars)))
-    count = len(whole.data.wavelengths_nm)
-    if whole.data.mixing is not None or count <= MAX_CHANNELS:
-        return whole.part(rows, tolerance=max(whole.config.tolerance, ROUGH))
-    order = np.argsort(whole.data.wavelengths_nm)
-    channels = np.sort(order[np.linspace(0, count - 1, MAX_CHANNELS).round().astype(int)])
-    return whole.part(rows, channels, max(whole.config.tolerance, ROUGH))
-
-
-def _some(data: Observations, count: int) -> np.ndarray:
-    """At most ``count`` rows, spread evenly over the order of the data, as many of each scan as it has part."""
-    total = len(data.radiance)
-    if total <= 2 * count:
-        return np.arange(total)
-    rows = np.sort(np.random.default_rng(0).permutation(total)[:count])
-    missing = [int(np.flatnonzero(data.scan == s)[0]) for s in range(data.scans) if not np.any(data.scan[rows] == s)]
-    return np.union1d(rows, np.array(missing, int))
-
-
-def _check_count(problem: Problem, samples: int) -> None:
-    unknowns = sum(not np.isfinite(s.prior_sigma) for s in problem.scalars)
-    if samples < max(unknowns, 1):
-        raise InputError(
-            f"observations: {samples} samples for {unknowns} unknowns without a prior; needed are at least {unknowns}"
-        )
-
-
-def _check_units(problem: Problem) -> None:
-    """Raise InputError where data and sky are so far apart, with and without aerosol, that the unit must be wrong."""
-    if any(s.positive and s.prior_sigma > 1.0 for s in problem.scalars):
-        return  # the calibration is free: any unit will do
-    ratio = np.inf
-    for factor in (1.0, 0.1, 10.0):
-        u = [s.inner(s.start * (factor if s.logarithmic and not s.nuisance else 1.0)) for s in problem.scalars]
-        predicted = problem.evaluate(np.array(u)).predicted[problem.data.used]
-        found = float(np.median(problem.data.radiance[problem.data.used] / np.maximum(predicted, 1e-30)))
-        ratio = min(ratio, found, key=lambda r: abs(np.log(max(r, 1e-30))))
-        if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
-            return
-    raise InputError(
-        f"radiance: is {ratio:.3g} times that of the sky with the starting values; must be in W m^-2 sr^-1 nm^-1, "
-        "as solar_irradiance in W m^-2 nm^-1 (or 1/sr where that is 1)"
-    )

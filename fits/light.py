@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
@@ -50,9 +49,9 @@ class RayLight:
         def made() -> Any:
             same = len(channels) == len(sky.atmosphere.wavelengths_nm)
             several = sky if same else Sky(side_by_side, None, sky.tolerance, sky.resolution, sky.suns, sky.layout)
-            return Recordings(grid), _light_of(several), [band.optics for band in several.solutions]
+            return Recordings(grid), several, [band.optics for band in several.solutions]
 
-        self._recordings, self._light, self._optics = grid.kept(("rays of fits", *key), made)
+        self._recordings, self._sky, self._optics = grid.kept(("rays of fits", *key), made)
 
     def __call__(self, air: Atmosphere, sun_zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         """Radiance [N, C] for an atmosphere like ``side_by_side``, and angles [N] (radians) of the sun and of the view
@@ -64,10 +63,23 @@ class RayLight:
         if np.array_equal(sun_zenith, first_sun) and np.array_equal(azimuth, first_azimuth):
             views, which = [v[self._one_of] for v in views], self._which
         arguments = values, self._shares, [doubles(v) for v in views]
-        # Of other numbers of rays there are other recordings.
-        run = self._recordings.run if self._recorded else lambda _, light, *arguments: light(*arguments)
-        light = run(len(views[0]), self._light, *arguments)
+        if self._recorded:  # of other numbers of rays there are other recordings
+            light = self._recordings.run(len(views[0]), self._light, *arguments, prepare=self._solved)
+        else:
+            light = self._light(*arguments)
         return np.stack([v.numpy() for v in light], axis=-1).astype(float)[which]
+
+    def _light(self, values: list[Any], shares: list[Any], views: list[Any]) -> list[Any]:
+        """Radiance, Floats [N], of optics' values, shares of the orders, and the arguments of Sky.rays."""
+        sky = self._solved(values, shares)
+        shells = sky.grid.kept("shells of fits", lambda: _shells(sky))
+        return [v + 0.0 for v in sky.rays(*views, shells=shells).radiance]
+
+    def _solved(self, values: list[Any], shares: list[Any], *_: Any) -> Sky:
+        sky = self._sky.again(values, shares)
+        for band in sky.solutions:
+            band.field.prepare()
+        return sky
 
 
 def _distinct(
@@ -94,18 +106,6 @@ def _shares(sky: Sky, channels: np.ndarray) -> list[Any]:
                 table[n, i][:, band.optics.indices] = share.numpy().reshape(-1, len(band.optics.indices))
     bands = [table[..., channels[i : i + MAX_CHANNELS]] for i in range(0, len(channels), MAX_CHANNELS)]
     return [[[floats(share) for share in both] for both in band] for band in bands]
-
-
-def _light_of(sky: Sky) -> Any:
-    """Radiance, Floats [N], of optics' values, shares of the orders, and the arguments of Sky.rays."""
-
-    def light(values: list[Any], shares: list[Any], views: list[Any]) -> list[Any]:
-        rays = sky.again(values, shares).rays(*views, shells=sky.grid.kept("shells of fits", lambda: _shells(sky)))
-        radiance = [v + 0.0 for v in rays.radiance]
-        dr.eval(radiance)
-        return radiance
-
-    return light
 
 
 def _shells(sky: Sky) -> Shells:

@@ -236,7 +236,12 @@ def _read_csv(path: Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
         raise InputError(f"{name}: cannot be read ({reason})") from None
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    rows = list(csv.reader(line for _, line in lines))
+    try:
+        rows = list(csv.reader(line for _, line in lines))
+    except csv.Error as error:
+        raise InputError(f"{name}: is not CSV ({shown(str(error), 100)})") from None
+    if len(rows) != len(lines):
+        raise InputError(f"{name}: has a quote without an end in its line")
     if len(rows) < 2:
         raise InputError(f"{name}: holds no samples; must have a line of names and a line for each sample")
     header = [column.strip() for column in rows[0]]

@@ -35,6 +35,7 @@ import numpy as np
 
 from atmo_jit import scenes
 from atmo_jit.errors import InputError, shown
+from atmo_jit.files import is_file
 from atmo_jit.image import read_planes
 from atmo_jit.spectrum import SpectralBasis
 
@@ -156,7 +157,7 @@ def _settings(
         if not isinstance(given.get("scene"), str):
             raise InputError(f"picture.scene: is {shown(given.get('scene'))}; must be the name of a scene file")
         beside = folder / given["scene"]
-        path = scenes.find(str(beside) if beside.is_file() else given["scene"])
+        path = scenes.find(str(beside) if is_file(beside) else given["scene"])
         defaults |= {"sun_zenith_deg": 0.0}
         if size is not None:
             found["camera"] = of_scene(path, *size)

@@ -17,6 +17,7 @@ import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, InputError, shown
+from atmo_jit.files import is_file
 from atmo_jit.refraction import lift
 from atmo_jit.wavelengths import at_wavelengths, chosen
 
@@ -182,7 +183,7 @@ def atmosphere_of(props: Any, find_file: Any) -> Atmosphere:
         except json.JSONDecodeError as error:
             raise AtmosphereError("atmosphere", f"invalid JSON ({error})", "a JSON object") from None
     found = Path(find_file(source))
-    return Atmosphere.load(found if found.is_file() else source)
+    return Atmosphere.load(found if is_file(found) else source)
 
 
 def at_given_wavelengths(props: Any, atmosphere: Atmosphere) -> Atmosphere:

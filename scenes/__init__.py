@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 from atmo_jit.errors import InputError, shown
+from atmo_jit.files import is_file
 
 FOLDER = Path(__file__).parent
 SUFFIXES = (".xml", ".json")
@@ -26,7 +27,7 @@ def find(scene: str) -> Path:
     """
     path = Path(scene)
     if path.suffix.lower() in SUFFIXES:
-        if path.is_file():
+        if is_file(path):
             return path
         raise InputError(f"scene {shown(scene)}: no such file; shipped scenes: {', '.join(shipped())}")
     if scene in shipped():

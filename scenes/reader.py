@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from atmo_jit.errors import InputError, one_line
+from atmo_jit.files import is_file
 from atmo_jit.partial import digest
 from atmo_jit.scenes import json_form
 
@@ -74,11 +75,9 @@ def contents(state: Any) -> str:
         for key in node.props.keys():
             value = node.props[key]
             if isinstance(value, str):
-                # A string may be anything; file systems refuse some as names.
-                with suppress(OSError, ValueError):
-                    file = Path(str(mi.file_resolver().resolve(value)))
-                    if file.is_file():
-                        found.append(file)
+                file = Path(str(mi.file_resolver().resolve(value)))
+                if is_file(file):  # a string may be anything
+                    found.append(file)
             if not isinstance(value, str | int | float):  # what Mitsuba prints of arrays is rounded
                 with suppress(TypeError, ValueError):
                     # Asked of the type: an array has any attribute, as swizzling.

@@ -82,7 +82,8 @@ def parse(line):
         command.make_context(words[1], words[2:])
         return
     module = import_module(words[2])
-    if "argparse" not in vars(module):  # files, or nothing
+    begins = getattr(module, "main", None)
+    if begins is None or "argparse" not in begins.__globals__:  # takes files, or nothing
         assert "__main__" in Path(module.__file__).read_text(encoding="utf-8")
         assert all(re.fullmatch(r"\S+\.(json|md)", word) for word in words[3:])
         return

@@ -1,11 +1,15 @@
 """What an atmosphere needs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import atmo_jit
+from atmo_jit.backend import doubles
 from atmo_jit.phase import HenyeyGreenstein
 from atmo_jit.resolution import FIRST_DEGREES, Resolution, moments_of
+from atmo_jit.sky import Sky
 
 EARTH = atmo_jit.Atmosphere.load("earth")
 
@@ -28,6 +32,30 @@ def test_haze_needs_more_moments_the_more_it_peaks():
 def test_fog_needs_more_altitudes_and_accuracy_costs():
     assert suited({"mie.scattering_per_m": 5e-3}).altitudes > suited().altitudes
     assert suited(tolerance=0.001).first_degree > suited().first_degree
+
+
+def test_fine_solves_have_all_degrees_in_all_orders():
+    for changes in ({}, {"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.85}):
+        air = EARTH.replace(changes)
+        usual, fine = (Resolution.suited(air, 0.01, fine=fine) for fine in (False, True))
+        assert [stage.degree for stage in fine.stages] == [fine.first_degree]
+        assert fine.first_degree > usual.first_degree and fine.altitudes > usual.altitudes
+        assert fine.stages[0].most == usual.stages[0].most
+
+
+def test_haze_with_a_narrow_peak_has_no_ripple():
+    """Moments cut off too early ripple along the horizon: against twice as many the light is smooth there to 1 %."""
+    air = EARTH.replace({"mie.scattering_per_m": 1e-4, "mie.phase": {"type": "cornette_shanks", "g": 0.9}})
+    azimuth = np.radians(np.arange(90.0, 181.0, 5.0))
+    rays = [np.zeros(azimuth.shape), np.full(azimuth.shape, np.radians(70.0)), np.full(azimuth.shape, np.radians(89.0))]
+    usual = Resolution.suited(air, 0.01)
+    many = {"first_degree": 48, "first_up": 60, "first_down": 58, "first_azimuths": 64, "phase_degree": 64}
+    light = []
+    for resolution in (usual, replace(usual, **many)):
+        sky = Sky(air, resolution=resolution)
+        found = sky.rays(*map(doubles, [*rays, azimuth]), ground=False).radiance
+        light.append(np.stack([channel.numpy() for channel in found]))
+    assert light[0] == pytest.approx(light[1], rel=0.01)
 
 
 def test_as_many_moments_as_are_asked_for():

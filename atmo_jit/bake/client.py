@@ -19,7 +19,7 @@ from ..column import column_up
 from ..mapping import Bruneton, texels
 from ..phase import RayleighPhase
 from ..sky import Sky
-from .mean_source import MeanSource, Series, view_range
+from .mean_source import MeanSource, view_range
 from .sightlines import NODES, Sightlines
 from .sunlight import Sunlight
 
@@ -200,8 +200,7 @@ def scattered_light(
     if band.source is not None:
         edge, end = view_range(optics.atmosphere.bottom_radius_m, optics.atmosphere.thickness_m, h[:, None])
         x = mapping.from_horizon(mapping.half_elevation(mu), edge, np.where(ground, -mapping.STEEPEST, end))
-        whole = lines.scattering.reshape(*mu.shape, len(optics.scatterers), -1)
-        series = Series.of(MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, whole))
+        series = MeanSource(band, mu_s).along(h, np.clip(x, 0.0, 1.0), ~ground, lines.scattering_table)
         lanes = _Lanes(mu, mu_s, slice(0, len(mu_s)), angle, angles)
         # Polynomials swing about 0 where no light is left.
         values = series.at(lanes.ray * len(mu_s) + lanes.sun, lanes.cos_phi)

@@ -16,7 +16,7 @@ from .. import mapping
 from ..backend import floats, packet, padded, stored, types, uints
 from ..optics import Optics
 from ..quadrature import half_circle
-from .sightlines import Sightlines, padded_channels
+from .sightlines import Sightlines
 
 ALTITUDES = 8
 # Nodes above and below the horizon and in azimuth at least; the latter where altitudes share them.
@@ -26,50 +26,71 @@ COARSE_DEGREE = 9  # of tables over all suns and altitudes
 
 
 class MeanSource:
-    """Means for the suns ``mu_s`` [S], at Chebyshev nodes from the ground to the top.
+    """Means for the suns ``mu_s`` [S], at Chebyshev nodes from the ground to the top; all sums are kernels.
 
-    ``harmonics`` [altitude, channel, scatterer, up + down, sun, azimuthal order].
+    NumPy's products of matrices would do too, but they wait for each other where other programs run: several times as
+    long as they take alone.
     """
 
     def __init__(self, band: Any, mu_s: np.ndarray) -> None:
-        self.optics = band.optics
-        self.thickness = self.optics.atmosphere.thickness_m
-        self.up, down, azimuths = counts(min(band.field.degree, COARSE_DEGREE), LEAST_COARSE)
+        t, self.optics = types(), band.optics
+        air, suns = self.optics.atmosphere, len(mu_s)
+        self.thickness, self.suns = air.thickness_m, suns
+        self.up, down, self.azimuths = counts(min(band.field.degree, COARSE_DEGREE), LEAST_COARSE)
+        azimuths = self.azimuths
         h = self.thickness * chebyshev_nodes(ALTITUDES) ** 2
         x, up = places(self.up, down)
-        radius = self.optics.atmosphere.bottom_radius_m
-        mu = view_cosines(radius, self.thickness, h[:, None], x, up)
+        self.count = len(x)
+        mu = view_cosines(air.bottom_radius_m, self.thickness, h[:, None], x, up)
         lines = Sightlines(self.optics, np.repeat(h, len(x)), mu.ravel(), stretches=STRETCHES)
-        t = types()
-        suns = len(mu_s)
         lane = dr.arange(t.UInt, mu.size * suns * azimuths)
         rest = lane // azimuths
         sun = dr.gather(t.Float, floats(mu_s), rest % suns)
         sin_s = dr.gather(t.Float, floats(np.sqrt((1.0 - mu_s) * (1.0 + mu_s))), rest % suns)
         across = sin_s * dr.gather(t.Float, floats(np.cos(half_circle(azimuths))), lane % azimuths)
-        ray = rest // suns
-        light = lines.multiple(band.source, ray, sun, across, lines.nu(ray, sun, across))
-        dr.eval(light)
-        values = np.stack([np.stack([c.numpy() for c in kind], axis=-1) for kind in light], axis=-2)
-        values = values.reshape(len(h), len(x), suns, azimuths, *values.shape[1:])
-        whole = lines.scattering.reshape(len(h), len(x), 1, 1, *values.shape[4:])
-        mean = np.divide(values, whole, out=np.zeros_like(values), where=whole > 0.0)
-        self.harmonics = np.einsum("mj,avsjkc->ackvsm", cosine_series(azimuths), mean, optimize=True)
+        self._mean = means(lines, band.source, rest // suns, sun, across)
 
-    def along(self, h: np.ndarray, x: np.ndarray, up: np.ndarray, scattering: np.ndarray) -> np.ndarray:
-        """Cosine series in azimuth of the radiance along rays, float32 [A, V, S, azimuthal order, C].
+    def along(self, h: np.ndarray, x: np.ndarray, up: np.ndarray, scattering: Any) -> Series:
+        """Cosine series in azimuth of the radiance along rays, [A x V x S] rows.
 
         ``h`` [A] (m); ``x`` [A, V]: place between the horizon (0) and zenith or nadir (1) as in :func:`view_cosines`,
-        ``up`` [V] or [A, V]: which of the two; ``scattering`` [A, V, K, C]: of :class:`Sightlines` for these rays.
+        ``up`` [V] or [A, V]: which of the two; ``scattering``: Sightlines.scattering_table of these rays.
         """
-        altitudes, channels, kinds, v, suns, orders = self.harmonics.shape
-        place = chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0)))
-        values = place.astype(np.float32) @ self.harmonics.reshape(altitudes, -1)
-        matrix = interpolation(self.up, v, x, up)
-        # All at once, scatterers added up: one product of matrices per altitude and channel.
-        weights = np.einsum("avkc,avn->acvkn", scattering.astype(np.float32), matrix)
-        sums = weights.reshape(len(h), channels, -1, kinds * v) @ values.reshape(len(h), channels, kinds * v, -1)
-        return np.moveaxis(sums.reshape(len(h), channels, -1, suns, orders), 1, -1)
+        t, azimuths, count, suns = types(), self.azimuths, self.count, self.suns
+        place = floats(chebyshev_matrix(ALTITUDES, np.sqrt(np.clip(h / self.thickness, 0.0, 1.0))))
+        series, mean = floats(cosine_series(azimuths)), self._mean
+        width = row_length(self.optics)
+        lane = dr.arange(t.UInt, len(h) * count * suns * azimuths)
+        order, rest = lane % azimuths, lane // azimuths
+        altitude, place_in = rest // (count * suns), rest % (count * suns)
+
+        def sample(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            node = i // azimuths
+            j = i - node * azimuths
+            weight = dr.gather(t.Float, place, dr.fma(altitude, ALTITUDES, node))
+            weight *= dr.gather(t.Float, series, dr.fma(order, azimuths, j))
+            here = packet(mean, (node * (count * suns) + place_in) * azimuths + j, width)
+            return i + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
+
+        sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+        end = dr.opaque(t.UInt, ALTITUDES * azimuths, 1)
+        _, sums = dr.while_loop((t.UInt(0), sums), lambda i, _: i < end, sample, label="mean source: altitudes")
+        there = stored(sums, lane, width)
+        matrix = floats(interpolation(self.up, count, x, up))
+        start, stop = (uints(v) for v in halves(self.up, count, np.broadcast_to(up, x.shape).ravel()))
+        lane = dr.arange(t.UInt, x.size * suns * azimuths)
+        ray, of_sun = lane // (suns * azimuths), lane % (suns * azimuths)
+        first = ray // x.shape[1] * (count * suns * azimuths) + of_sun
+        end = dr.gather(t.UInt, stop, ray)
+
+        def node(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            weight = dr.gather(t.Float, matrix, dr.fma(ray, count, i))
+            here = packet(there, dr.fma(i, suns * azimuths, first), width)
+            return i + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
+
+        state = (dr.gather(t.UInt, start, ray), [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)])
+        _, sums = dr.while_loop(state, lambda i, _: i < end, node, label="mean source: rays")
+        return Series(self.optics, sums, packet(scattering, ray, width), azimuths)
 
 
 def counts(degree: int, least: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -99,6 +120,11 @@ def interpolation(above: int, count: int, x: np.ndarray, up: np.ndarray) -> np.n
     for half, nodes in ((up, slice(0, above)), (~up, slice(above, count))):
         matrix[..., nodes][half] = chebyshev_matrix(nodes.stop - nodes.start, x[half])
     return matrix
+
+
+def halves(above: int, count: int, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First node and the one after the last on each ray's side of the horizon: all that its polynomial has."""
+    return np.where(up, 0, above), np.where(up, above, count)
 
 
 def view_cosines(radius: float, thickness: float, h: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -147,8 +173,7 @@ class MeanSourceHere:
         self._cosines = floats(np.cos(half_circle(self.azimuths)))
         self._series = floats(cosine_series(self.azimuths))
         self._matrix = floats(interpolation(above, self.count, x, up))
-        # The nodes on a ray's side of the horizon are all that its polynomial has.
-        self._start, self._end = uints(np.where(up, 0, above)), uints(np.where(up, above, self.count))
+        self._start, self._end = (uints(v) for v in halves(above, self.count, up))
 
     def lines(self, optics: Optics) -> Sightlines:
         """The rays along which it is asked."""
@@ -160,47 +185,51 @@ class MeanSourceHere:
         ``lines``: those of this object for the values at hand; ``scattering``: of the rays, as
         Sightlines.scattering_table gives it.
         """
-        t, optics, azimuths = types(), lines.optics, self.azimuths
-        channels, kinds = optics.channel_count, len(optics.scatterers)
-        size = padded(channels)
+        t, azimuths = types(), self.azimuths
+        width = row_length(lines.optics)
         lane = dr.arange(t.UInt, self.count * azimuths)
         across = sin_s * dr.gather(t.Float, self._cosines, lane % azimuths)
-        ray, sun = lane // azimuths, mu_s + dr.zeros(t.Float, dr.width(lane))
-        table = lines.scattering_table
-        light = lines.multiple(source, ray, sun, across, lines.nu(ray, sun, across))
-        light = [v for kind in light for v in (*kind, *[t.Float(0.0)] * (size - channels))]
-        whole = packet(table, ray, kinds * size)
-        mean = [dr.select(w > 0.0, v / dr.select(w > 0.0, w, 1.0), 0.0) for v, w in zip(light, whole, strict=True)]
-        mean = stored(mean, lane, kinds * size)
+        mean = means(lines, source, lane // azimuths, mu_s + dr.zeros(t.Float, dr.width(lane)), across)
         lane = dr.arange(t.UInt, dr.width(self._start) * azimuths)
         ray, order = lane // azimuths, lane % azimuths
-        start, end = (dr.gather(t.UInt, which, ray) for which in (self._start, self._end))
+        start, end = (dr.gather(t.UInt, which, ray) * azimuths for which in (self._start, self._end))
 
         def sample(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
             node = i // azimuths
             weight = dr.gather(t.Float, self._matrix, dr.fma(ray, self.count, node))
             weight *= dr.gather(t.Float, self._series, dr.fma(order, azimuths, i - node * azimuths))
-            here = packet(mean, i, kinds * size)
-            return i + 1, [dr.fma(weight, a, b) for a, b in zip(here, sums, strict=True)]
+            return i + 1, [dr.fma(weight, a, b) for a, b in zip(packet(mean, i, width), sums, strict=True)]
 
-        sums, end = [dr.zeros(t.Float, dr.width(lane)) for _ in range(kinds * size)], end * azimuths
-        _, sums = dr.while_loop((start * azimuths, sums), lambda i, _: i < end, sample, label="mean source: along")
-        whole = packet(scattering, ray, kinds * size)
-        series = [sum(sums[n * size + c] * whole[n * size + c] for n in range(kinds)) for c in range(size)]
-        return Series(stored(series, lane, size), azimuths, channels)
+        sums = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+        _, sums = dr.while_loop((start, sums), lambda i, _: i < end, sample, label="mean source: along")
+        return Series(lines.optics, sums, packet(scattering, ray, width), azimuths)
+
+
+def means(lines: Sightlines, source: Any, ray: Any, mu_s: Any, across: Any) -> Any:
+    """What the rays gather of later orders over what they scatter, by scatterer: table [lane, scatterer x padded
+    channel]. Arguments as for Sightlines.multiple."""
+    t, optics = types(), lines.optics
+    none = [t.Float(0.0)] * (padded(optics.channel_count) - optics.channel_count)
+    width, table = row_length(optics), lines.scattering_table
+    light = lines.multiple(source, ray, mu_s, across, lines.nu(ray, mu_s, across))
+    pairs = zip([v for kind in light for v in (*kind, *none)], packet(table, ray, width), strict=True)
+    mean = [dr.select(w > 0.0, v / dr.select(w > 0.0, w, 1.0), 0.0) for v, w in pairs]
+    return stored(mean, dr.arange(t.UInt, dr.width(ray)), width)
+
+
+def row_length(optics: Optics) -> int:
+    """Floats per row of tables by scatterer and padded channel."""
+    return len(optics.scatterers) * padded(optics.channel_count)
 
 
 class Series:
-    """Cosine series in azimuth, a table [row, azimuthal order, padded channel], evaluated by a kernel."""
+    """Cosine series in azimuth, [row, azimuthal order, channel], stored and evaluated by kernels: the sum over
+    scatterers of their means times what a ray scatters, both [scatterer x padded channel] per row and order."""
 
-    def __init__(self, buffer: Any, orders: int, channels: int) -> None:
-        self.buffer, self.orders, self.channels = buffer, orders, channels
-
-    @classmethod
-    def of(cls, series: np.ndarray) -> Series:
-        """Those of an array [..., azimuthal order, C]."""
-        *_, orders, channels = series.shape
-        return cls(padded_channels(series), orders, channels)
+    def __init__(self, optics: Optics, mean: list[Any], scattering: list[Any], orders: int) -> None:
+        self.orders, self.channels, size = orders, optics.channel_count, padded(optics.channel_count)
+        sums = [sum(m * s for m, s in zip(mean[c::size], scattering[c::size], strict=True)) for c in range(size)]
+        self.buffer = stored(sums, dr.arange(types().UInt, dr.width(mean)), size)
 
     def at(self, row: Any, cos_phi: Any) -> list[Any]:
         """Per channel: sum over m of series[row, m] cos(m phi)."""

@@ -26,7 +26,7 @@ from .sunlight import Sunlight
 # Quadrature of single scattering per piece of a ray: more where the planet's shadow crosses it, below this sun cosine.
 DAY_NODES, TWILIGHT_NODES, TWILIGHT = 3, 10, 0.05
 SUNLIGHT = (96, 320)  # size of the table of sunlight: altitudes, sun cosines
-REMEMBERED = 6  # observers that are kept with a grid
+REMEMBERED = 3  # observers, of two sets of rays each: as many as ray_pieces remembers
 
 
 @dataclass
@@ -108,6 +108,9 @@ def packed(optics: Any, nodes: Nodes, nu: Any, toward_sun: Any, light: NodeLight
     return cells.words, colours
 
 
+_known: OrderedDict[Any, _Observer] = OrderedDict()
+
+
 @one_at_a_time
 def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> Baked:
     """Light at the nodes of a table from the solution itself; with the ``ground``'s or not."""
@@ -115,15 +118,16 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> Baked:
     quadrature = DAY_NODES if nodes.mu_s > TWILIGHT else TWILIGHT_NODES
     key = (
         *(nodes.h, nodes.x.tobytes(), nodes.up.tobytes(), nodes.cos_phi.tobytes(), ground, quadrature),
-        *(optics.make_up, optics.phase_kinds, field.degree, field.scatters, band.columns),
+        *(optics.make_up, optics.phase_kinds, grid, field.degree, field.scatters, band.columns),
     )
-    known = grid.kept("observers of tables", OrderedDict)
-    if key not in known or optics.phase_kinds is None:
-        known[key] = _Observer(band, nodes, ground, quadrature)
-    known.move_to_end(key)
-    while len(known) > REMEMBERED:
-        known.popitem(last=False)
-    return known[key].baked(band, nodes)
+    if optics.phase_kinds is None:  # kernels would hold numbers of the phase functions: nothing to be played back
+        return _Observer(band, nodes, ground, quadrature).baked(band, nodes)
+    if key not in _known:
+        _known[key] = _Observer(band, nodes, ground, quadrature)
+    _known.move_to_end(key)
+    while len(_known) > REMEMBERED:
+        _known.popitem(last=False)
+    return _known[key].baked(band, nodes)
 
 
 class _Observer:

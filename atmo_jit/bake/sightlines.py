@@ -59,11 +59,11 @@ class Sightlines:
         self.optics = optics
         rays = Rays.of(optics, h, mu, start, stop, ground)
         self.start, self.stop, self.ground = rays.start, rays.stop, rays.ground
-        extinction = np.array([c.extinction_per_m[optics.indices] for c in optics.constituents])
-        extinction = extinction.reshape(-1, optics.channel_count)
-        # Nodes for somewhat more and for somewhat less matter: a small change of it then moves none.
+        extinction = np.array([c.extinction_per_m for c in optics.constituents])
+        extinction = extinction.reshape(-1, len(optics.atmosphere.wavelengths_nm))
+        # Nodes for all bands, and for somewhat more and somewhat less matter: a small change of it then moves none.
         whole = rays.pieces(in_steps(extinction, up=True))
-        self.transmittance = np.exp(-(extinction.T @ whole.total)).T
+        self.transmittance = np.exp(-(extinction[:, optics.indices].T @ whole.total)).T
         self._pieces, self._parts, self._ends = whole, stretches, rays.ends
         depth = in_steps(extinction, up=False).T @ whole.from_start
         self._seen = depth.min(axis=0, initial=np.inf) < SPENT_DEPTH

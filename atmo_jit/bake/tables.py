@@ -24,7 +24,7 @@ from ..mapping import texels
 from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
 from ..sky import RayLight, Sky
-from .mean_source import MeanSource, Series, view_cosines
+from .mean_source import MeanSource, view_cosines
 from .node_light import NodeLight, Nodes, is_peaked
 from .sightlines import Sightlines
 from .sunlight import Sunlight
@@ -191,9 +191,8 @@ class _Band4D:
         single = lines.single(Sunlight(optics, self.band.columns), ray, cosine, across, nu)
         smooth = [dr.zeros(t.Float, dr.width(lane)) for _ in range(self.channels)]
         if self.band.source is not None:
-            whole = lines.scattering.reshape(len(h), rows, *lines.scattering.shape[1:])
             places = np.broadcast_to(x, (len(h), rows))
-            series = Series.of(MeanSource(self.band, mu_s).along(h, places, is_up, whole))
+            series = MeanSource(self.band, mu_s).along(h, places, is_up, lines.scattering_table)
             smooth = series.at(ray * suns + sun, cos_phi)
         for n, k in enumerate(optics.scatterers):
             if n not in self.peaks:

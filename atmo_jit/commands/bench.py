@@ -51,9 +51,9 @@ def command(
     for name in methods:
         method_of(name)
     Atmosphere.load(atmosphere)
+    check_folder(out)
     if not out.exists() and not out.parent.is_dir():
         raise InputError(f"--out {str(out)!r}: there is no folder {str(out.parent)!r}")
-    check_folder(out)
     drawn = find_spec("matplotlib") is not None
     names = ["bench.json", "bench.md"] + ["bench.png"] * drawn
     if out.exists():

@@ -59,6 +59,12 @@ def test_a_small_change_of_the_air_moves_no_nodes():
     assert lines(8.0).at is not kept[-1]
 
 
+def test_all_bands_have_the_same_nodes(odd_sky):
+    """Else one band's would be made anew after every other's."""
+    found = [Sightlines(band.optics, np.full(9, 2.0), np.linspace(-1.0, 1.0, 9)) for band in odd_sky.solutions]
+    assert len(found) == 2 and found[0].at is found[1].at
+
+
 def test_steps_are_on_the_safe_side():
     values = np.array([0.0, 1e-30, 3e-6, 1.0, 7.0])
     up, down = in_steps(values, up=True), in_steps(values, up=False)

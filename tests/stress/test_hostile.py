@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import subprocess
 import sys
 import zipfile
@@ -11,9 +12,12 @@ from random import Random
 import numpy as np
 import pytest
 
+from atmo_jit.cli import main
+from atmo_jit.errors import InputError
+from atmo_jit.fits import load_observations
 from bench.damage import damaged, hostile_npz, npz
 from bench.hostile import feed
-from bench.hostile_targets import targets
+from bench.hostile_targets import SCENE, targets
 
 LIMITED = """
 import resource, sys
@@ -63,3 +67,39 @@ def test_a_bomb_takes_no_memory(tmp_path):
         assert done.returncode in (0, 2), done.stderr
         assert i or (done.returncode == 2 and done.stderr.count("\n") == 1)
     assert not (tmp_path / "mark").exists()
+
+
+@pytest.mark.parametrize("name", ["9" * 5000, "a\0b", "x" * 300 + ".json"])
+def test_names_that_no_file_system_takes(name, tmp_path, capsys):
+    """Wherever a file may be named: one line."""
+    np.savez(tmp_path / "views.npz", altitude_m=0.0)
+    (tmp_path / "fit.toml").write_text(f"atmosphere = {json.dumps(name)}\n[free]\nground_albedo = {{}}\n")
+    (tmp_path / "scene.json").write_text(json.dumps(SCENE | {"sky": {"type": "atmosphere", "atmosphere": name}}))
+    views, config, scene = (str(tmp_path / file) for file in ("views.npz", "fit.toml", "scene.json"))
+    for arguments in (
+        ["sky", "--atmosphere", name, "--views", views, "--out", str(tmp_path / "o.npz")],
+        ["sky", "--atmosphere", "earth", "--views", name, "--out", str(tmp_path / "o.npz")],
+        ["sky", "--atmosphere", "earth", "--views", views, "--out", f"{name}.npz"],
+        ["fit", "--observations", views, "--config", config, "--out", str(tmp_path / "o.json")],
+        ["render", scene, "--out", str(tmp_path / "o.exr")],
+        ["render", f"{name}.xml", "--out", str(tmp_path / "o.exr")],
+        ["plan", name],
+        ["export", "--atmosphere", "earth", "--layout", "native", "--out", name * 2],
+        ["bench", "--out", name * 2, "--quick"],
+    ):
+        if "\0" in "".join(arguments):  # files can hold what no command line can
+            continue
+        assert main(arguments) == 2, arguments
+        said = capsys.readouterr().err
+        assert said.startswith("atmo-jit: ") and said.count("\n") == 1 and len(said) < 2000, said
+    assert {path.name for path in tmp_path.iterdir()} == {"views.npz", "fit.toml", "scene.json"}
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [('0,"40', "a quote without an end"), ("0," + "9" * 200_000, "is not CSV"), ("0,4e1,3", "line 2 has 3 values")],
+)
+def test_rows_that_are_none(row, text, tmp_path):
+    (tmp_path / "scan.csv").write_text(f"altitude_m,radiance\n{row}\n0,1\n")
+    with pytest.raises(InputError, match=text):
+        load_observations(tmp_path / "scan.csv")

@@ -120,9 +120,13 @@ def test_a_file_that_cannot_be_written(every, unprivileged, last):
         assert there == dict.fromkeys(work.outputs, OLD.decode()), work.name
 
 
-@pytest.mark.parametrize("how", ["file system", "limit"])
-def test_a_full_disk(every, how):
+@pytest.mark.parametrize(
+    ("how", "count"),
+    [("file system", 2), *(pytest.param(how, 6, marks=pytest.mark.slow) for how in ("file system", "limit"))],
+)
+def test_a_full_disk(every, how, count):
     """Of a file system that is full; and a limit to the size of files, for which nobody needs rights."""
+    every = every[:count]
     folder = str(every[0].folder.parent)
     full = ("unshare", "--mount", "bash", "-c", FULL, "full", folder)
     for work, (status, said, there) in run(every, *full) if how == "file system" else run(every, limit=100):
