@@ -29,6 +29,7 @@ from .single_scattering import first_order
 from .total import following, total_of
 
 LEAST = 1e-6  # of the light: an order that is less says nothing of those that follow
+STEADY = 40  # orders after which no light grows: what does is rounding, and is left out
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
 
@@ -50,8 +51,11 @@ def solve(
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
     for n in range(AT_ONCE, most + 1):
         if orders is None and later:
-            weights, error = _extrapolated(np.stack(probes))
-            arriving = weights
+            new, error = _extrapolated(np.stack(probes))
+            if n > STEADY and not np.isfinite(error):
+                later.pop()
+                break
+            weights = arriving = new
             if error < resolution.converged * tolerance:
                 break
         if n == most:

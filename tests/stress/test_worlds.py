@@ -73,3 +73,9 @@ def test_orders_of_a_sharp_peak_shrink():
     """48: fog with g = 0.99. Radiance that swings below 0 beside its peak grew fourfold with every order."""
     sky = atmo_jit.Sky(extreme_world(Random(48)))
     assert max(len(band.field.shares) for band in sky.solutions) < 50
+
+
+def test_rounding_that_grows_from_order_to_order_is_left_out():
+    """194: a white cloud of depth 25; in the deepest shadow late orders were brighter than the first."""
+    sky = atmo_jit.Sky(extreme_world(Random(194), widths=(1,)))
+    assert max(len(band.field.shares) for band in sky.solutions) < 60
