@@ -45,6 +45,10 @@ DEFAULTS: dict[str, Any] = {
     "sun_angular_radius_deg": 0.2678,
 }
 REQUIRED = ("wavelengths_nm", "bottom_radius_m", "top_radius_m")
+# Of the largest air that is solved in any time: at 1e11 light is a third off, and 1e15 takes no end.
+RADIUS = Range(0, 1e10, low_open=True)
+# Every species makes the kernels larger: with this many the first solve takes half a minute, with thousands no end.
+MOST_SPECIES = 64
 SCATTERED_FRACTION = Range(0, 1, low_open=True)
 # Keys of which an object holds one or the other: replacing one of them by its dotted name drops the others.
 ALTERNATIVES = (
@@ -103,8 +107,8 @@ class Atmosphere:
         d = DEFAULTS | document
         wavelengths = numbers(d["wavelengths_nm"], "wavelengths_nm", POSITIVE)
         count = len(wavelengths)
-        bottom = number(d["bottom_radius_m"], "bottom_radius_m", POSITIVE)
-        top = number(d["top_radius_m"], "top_radius_m", POSITIVE)
+        bottom = number(d["bottom_radius_m"], "bottom_radius_m", RADIUS)
+        top = number(d["top_radius_m"], "top_radius_m", RADIUS)
         if top <= bottom:
             raise AtmosphereError(
                 "top_radius_m", shown(d["top_radius_m"]), f"a number above bottom_radius_m ({bottom:g})"
@@ -250,6 +254,9 @@ def _mie(d: Any, count: int) -> tuple[Constituent, ...]:
         return (_species(d, "mie", count),)
     if not d:
         raise AtmosphereError("mie", "an empty list", "null, an object, or a list of at least one object")
+    if len(d) > MOST_SPECIES:
+        allowed = f"null, an object, or a list of 1 to {MOST_SPECIES} objects"
+        raise AtmosphereError("mie", f"a list of {len(d)}", allowed)
     return tuple(_species(species, f"mie.{i}", count) for i, species in enumerate(d))
 
 

@@ -45,9 +45,7 @@ class SunColumns:
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
         atmosphere, breaks = optics.atmosphere, optics.breaks_m
-        heights = [c.profile.scale_height_m for c in optics.constituents if isinstance(c.profile, Exponential)]
-        thinnest = min([atmosphere.thickness_m, *heights])
-        knee = 0.7 * np.sqrt(2.0 * thinnest / atmosphere.bottom_radius_m)
+        knee = 0.7 * np.sqrt(2.0 * optics.thinnest_m / atmosphere.bottom_radius_m)
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
         self._rows = max(4, round(size[0] / self._shells))  # intervals per shell

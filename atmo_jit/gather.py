@@ -29,6 +29,8 @@ from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
 
+FAINT = 1e-15  # light of which no quotient is made: a derivative has its square below the line
+
 
 class Samples:
     """Where sun and azimuth stand at every visit of the paths, for every solved sun and azimuth: geometry that serves
@@ -124,13 +126,22 @@ class Gather:
         node = lane // per_ray * suns + dr.minimum(lane % per_ray, suns - 1)
         cosines = self.grid.kept(("cosines", azimuths), lambda: floats(np.cos(half_circle(azimuths))))
 
-        def add(j: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        def add(j: Any, sums: list[Any], means: list[Any]) -> tuple[Any, ...]:
             values = packet(radiance, node * azimuths + j, 4)[:channels]
-            return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j))
+            means = [v + mean for v, mean in zip(values, means, strict=True)]
+            values = [dr.maximum(v, 0.0) for v in values]
+            return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j)), means
 
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 1) * channels)]
+        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 2) * channels)]
         end = dr.opaque(t.UInt, azimuths, 1)
-        _, sums = dr.while_loop((t.UInt(0), zero), lambda j, _: j < end, add, max_iterations=-1, label="azimuths")
+        state = (t.UInt(0), zero[channels:], zero[:channels])
+        _, sums, means = dr.while_loop(state, lambda j, *_: j < end, add, max_iterations=-1, label="azimuths")
+        # A few azimuthal harmonics swing below 0 beside a forward peak. Left there they may grow from order to order;
+        # cut off they add light: so what is left is made as much as there was.
+        for c in range(channels):
+            lit = sums[c] > FAINT
+            share = dr.select(lit, dr.maximum(means[c], 0.0) / dr.select(lit, sums[c], 1.0), 1.0)
+            sums[c::channels] = [share * value for value in sums[c::channels]]
         return stored_harmonics(sums, channels, azimuths)
 
     def _rows(self, light: Moments, orders: int) -> Any:

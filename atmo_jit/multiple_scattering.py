@@ -28,6 +28,8 @@ from .resolution import Resolution
 from .single_scattering import first_order
 from .total import following, total_of
 
+LEAST = 1e-6  # of the light: an order that is less says nothing of those that follow
+STEADY = 40  # orders after which no light grows: what does is rounding, and is left out
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
 
@@ -49,8 +51,11 @@ def solve(
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
     for n in range(AT_ONCE, most + 1):
         if orders is None and later:
-            weights, error = _extrapolated(np.stack(probes))
-            arriving = weights
+            new, error = _extrapolated(np.stack(probes))
+            if n > STEADY and not np.isfinite(error):
+                later.pop()
+                break
+            weights = arriving = new
             if error < resolution.converged * tolerance:
                 break
         if n == most:
@@ -280,7 +285,8 @@ def _extrapolated(orders: np.ndarray) -> tuple[np.ndarray, float]:
     residual, whole = norm(gamma), norm(weights) + norms[..., 0]
     weights = weights + gamma  # the residual is the next term of the sum: take it too
     last, before = norms[..., -1], norms[..., -2]
-    ratio = np.divide(last, before, out=np.zeros_like(last), where=before > 0.0).max(axis=0)
+    counts = (before > 0.0) & (last > LEAST * whole)
+    ratio = np.divide(last, before, out=np.zeros_like(last), where=counts).max(axis=0)
     error = np.divide(residual, whole, out=np.zeros_like(residual), where=whole > 0.0).max(axis=0)
     error = np.where(ratio < 1.0, error / np.where(ratio < 1.0, 1.0 - ratio, 1.0), np.inf)
     return np.moveaxis(weights, -1, 0), float(error.max())

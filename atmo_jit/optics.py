@@ -30,6 +30,8 @@ LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
 # In fog, more: as long as a horizontal ray there has this optical depth.
 FURTHER, THIN = 4.0, 0.05
 RAMP, THICK = 0.25, 4.0
+STEEPER = 4.0
+FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
 _VALUES = (
     "radius",
     "thickness",
@@ -258,6 +260,7 @@ class Optics:
                 levels += _scale_height_levels(c.profile.scale_height_m, extinction, radius, top)
             else:
                 kinks.update(_ramp_levels(c.profile, extinction, radius))
+                kinks.update(self._under_steps(c))
         levels += kinks
         # Not np.unique: in its first call it imports all of numpy.ma.
         levels = np.array(sorted(set(np.clip(levels, 0.0, top).tolist())))
@@ -270,6 +273,23 @@ class Optics:
         if kept[-1] != top:
             kept.append(top)
         return np.array(kept)
+
+    def _under_steps(self, c: Any) -> list[float]:
+        return _levels_under_steps(c.profile, float(np.max(c.extinction_per_m)), self.atmosphere.bottom_radius_m)
+
+    @property
+    def thinnest_m(self) -> float:
+        """Scale (m) of the altitudes over which the steepest profile changes."""
+        scales = [self.atmosphere.thickness_m]
+        for c in self.constituents:
+            if isinstance(c.profile, Exponential):
+                scales.append(c.profile.scale_height_m)
+            elif isinstance(c.profile, Tent):
+                scales.append(c.profile.half_width_m)
+            else:
+                under = self._under_steps(c)
+                scales += [float(c.profile.altitude_m[np.searchsorted(c.profile.altitude_m, h)]) - h for h in under]
+        return min(scales)
 
     @cached_property
     def edge_levels_m(self) -> list[float]:
@@ -327,6 +347,29 @@ def phase_node(nu: Any) -> Any:
     middle = 0.5 * (PHASE_NODES - 1)
     step = middle * dr.safe_sqrt(1.0 - dr.abs(nu))
     return dr.select(nu > 0.0, 2.0 * middle - step, step)
+
+
+def _levels_under_steps(profile: Tent | Tabulated, extinction: float, radius: float) -> list[float]:
+    """Altitudes (m) under the steps at which a layer ends: a low sun shines into its top alone.
+
+    From a depth under the step at which a horizontal ray comes upon an optical depth of 1, by factors STEEPER, to that
+    at which a vertical ray does: from there on the view's own optical depth cuts it.
+    """
+    if isinstance(profile, Tent):
+        return []
+    altitude, density = profile.altitude_m, np.asarray(profile.values)
+    beyond = np.append(density[1:], 0.0)
+    ends = np.append(np.diff(altitude) == 0.0, True) & (density > beyond)
+    levels: list[float] = []
+    for i in np.flatnonzero(ends & (density * extinction > 0.0)):
+        top, rate = altitude[i], extinction * (density[i] - beyond[i])
+        floor = altitude[i - 1] if i else 0.0
+        below = 1.0 / (2.0 * (radius + top) * rate**2)
+        while below * rate < 1.0 and below < 0.5 * (top - floor):
+            if below > FINEST * top:
+                levels.append(float(top - below))
+            below *= STEEPER
+    return levels
 
 
 @lru_cache(maxsize=16)

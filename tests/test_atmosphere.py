@@ -325,6 +325,18 @@ def test_a_message_names_field_value_and_what_is_allowed(earth):
     assert text == "top_radius_m: found 6420000; allowed: a number above bottom_radius_m (6.42e+06)"
 
 
+@pytest.mark.parametrize("name", ["bottom_radius_m", "top_radius_m"])
+def test_radii_have_an_end(earth, name):
+    assert Atmosphere(changed(earth, "top_radius_m", 1e10)).top_radius_m == 1e10
+    assert str(refusal(changed(earth, name, 1e308))) == f"{name}: found 1e+308; allowed: a finite number in (0, 1e+10]"
+
+
+def test_species_are_counted(earth):
+    assert len(Atmosphere(changed(earth, "mie", [earth["mie"]] * 64)).mie) == 64
+    text = str(refusal(changed(earth, "mie", [earth["mie"]] * 65)))
+    assert text == "mie: found a list of 65; allowed: null, an object, or a list of 1 to 64 objects"
+
+
 def test_hostile_text_stays_on_one_short_line(earth):
     error = refusal(changed(earth, "mie.phase.type", "a\nb\x1b[31m" * 1000))
     assert len(str(error)) < 300 and str(error).isprintable()
