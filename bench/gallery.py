@@ -64,6 +64,8 @@ def squares(pictures: np.ndarray, size: int) -> np.ndarray:
 def shaded_squares(scene: Any, own: np.ndarray, spp: int) -> np.ndarray:
     """Which squares shadows in the air change by more than SHADED per cent: the same paths without them."""
     integrator = scene.integrator()
+    if not hasattr(integrator, "shaft_samples"):  # another integrator, for scenes without shapes
+        return np.zeros(squares(own, SQUARE).shape[1], dtype=bool)
     count, integrator.shaft_samples = integrator.shaft_samples, 0
     try:
         without, _ = passes(scene, PASSES, spp)

@@ -26,6 +26,9 @@ from .volpath import mis_weight, unpolarized
 # Shapes lie in valleys at most this deep (m): below it the planet's ground hides them.
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
+# Of a segment's light, that shapes may hide in one sample: the few walks that weigh most would leave black specks. A
+# bound of 1 would make shadows too bright.
+MOST_HIDDEN = 2.0
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
 SCALES = ("sun_scale", "sky_scale")
 TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
@@ -90,8 +93,8 @@ class AtmospherePath:
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
     points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders that shapes
-    keep from a segment, and that their surfaces add, is found by one random walk from a point of it, without bias but
-    with noise (docs/gallery.md has both). Two things in it are simplified: surfaces count as diffuse, and of the sky
+    keep from a segment, and that their surfaces add, is found by random walks from points of it, with noise, but
+    hardly a bias (docs/gallery.md has both). Two things in it are simplified: surfaces count as diffuse, and of the sky
     they see what their slope leaves of it, whatever else is in the way.
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
@@ -357,7 +360,7 @@ class AtmospherePath:
             most = None if self.orders is None else self.orders - 1
             later, surfaces = later_orders(air, scene, sampler, ray, part, toward, passed, colours, most, active)
             missing = [a + b for a, b in zip(missing, later, strict=True)]
-        return [a - b for a, b in zip(part.light, missing, strict=True)], surfaces
+        return [a - dr.minimum(b, MOST_HIDDEN * a) for a, b in zip(part.light, missing, strict=True)], surfaces
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""

@@ -37,6 +37,7 @@ LOBE = 0.4  # of the candidates, drawn about the ray, and as many about the sun;
 # all of the noise.
 MIXTURE = ((0.7, 1.0), (0.2, 0.25), (0.1, 0.0625))
 LEAST_RANGE = 1e-3  # of rate x length of a bounded path, where single precision resolves 1 - exp(-x)
+WALKS = 6  # for each segment: fewer cost less than the noise that they leave
 GO_ON = 0.75  # of the walks, after every scattering, at most
 FIRST_PARTS, PARTS = 4, 2  # of the quadrature of columns, on the way to the first point of a walk and to the next
 
@@ -57,19 +58,36 @@ def later_orders(
     because of shapes, and what surfaces of shapes add to it by scattering sun and sky into the air (the variant's
     spectrum, after the air ``passed`` of the path).
 
-    An estimate of one walk. ``toward``: direction to the sun; ``most`` scatterings after the one on the ray."""
+    An estimate of WALKS walks. ``toward``: direction to the sun; ``most`` scatterings after the one on the ray."""
     optics, rays = air.bands[0].optics, part.rays
     zero = dr.zeros(mi.Float, dr.width(rays.stop))
     h, _, _ = point_along(optics, rays, zero)
     rate = dr.maximum(air.guide.largest_extinction(air.guide.densities(h)), LEAST_EXTINCTION)
     active = active & (rays.stop > 0.0)
-    distance, density = bounded_path(rate, rays.stop, sampler.next_1d(active), sampler.next_1d(active))
-    inverse = 1.0 / density
-    amounts = air.columns(rays, zero, distance, [0.0 for _ in optics.constituents], FIRST_PARTS)
-    worth = [dr.exp(-depth) * inverse for band in air.bands for depth in band.optics.optical_depths(amounts)]
     walk = _Walk(air, scene, toward, passed, colours, ray.wavelengths, most)
+
+    def first(active: Any) -> tuple[Any, list[Any]]:
+        """Where a walk begins, and what light that is scattered there is worth."""
+        distance, density = bounded_path(rate, rays.stop, sampler.next_1d(active), sampler.next_1d(active))
+        inverse = 1.0 / (density * WALKS)
+        amounts = air.columns(rays, zero, distance, [0.0 for _ in optics.constituents], FIRST_PARTS)
+        worth = [dr.exp(-depth) * inverse for band in air.bands for depth in band.optics.optical_depths(amounts)]
+        return ray((part.gap + distance) * air.globe.scale), worth
+
+    def step(left: Any, *state: Any) -> tuple[Any, ...]:
+        """One of a walk; where it ends there, and others are ``left``, one begins."""
+        p, v, worth, even, missing, surfaces, depth, active, sampler = walk.step(*state)
+        anew = ~active & (left > 0)
+        there, new = first(anew)
+        p, v, even = dr.select(anew, there, p), dr.select(anew, ray.d, v), dr.select(anew, 1.0, even)
+        worth = [dr.select(anew, a, b) for a, b in zip(new, worth, strict=True)]
+        depth, left = dr.select(anew, 0, depth), left - dr.select(anew, mi.UInt32(1), mi.UInt32(0))
+        return left, p, v, worth, even, missing, surfaces, depth, active | anew, sampler
+
+    p, worth = first(active)
     state = (
-        ray((part.gap + distance) * air.globe.scale),
+        dr.select(active, mi.UInt32(WALKS - 1), mi.UInt32(0)),
+        p,
         mi.Vector3f(ray.d),
         worth,
         mi.Float(1.0) + zero,
@@ -79,8 +97,8 @@ def later_orders(
         mi.Bool(active),
         sampler,
     )
-    state = dr.while_loop(state, lambda *s: s[-2], walk.step, label="walk")
-    return state[4], state[5]
+    state = dr.while_loop(state, lambda *s: s[-2], step, label="walk")
+    return state[5], state[6]
 
 
 class _Walk:

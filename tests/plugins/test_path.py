@@ -98,7 +98,7 @@ def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
                 **things(),
             }
         )
-        found.append(of_passes(tiles(passes(scene, 12, 16), 4)))
+        found.append(of_passes(tiles(passes(scene, 24, 32), 4)))
     # 10 m of air are not much, but not nothing; and the emitter's table is not exact.
     for estimate in found:
         estimate.variance[:] += (0.002 * found[0].mean) ** 2
