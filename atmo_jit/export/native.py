@@ -71,6 +71,8 @@ def read(folder: Path, parameters: dict[str, Any]) -> Sky:
     arrays = read_npz(folder / FILE, kinds="f")
     held: dict[int, dict[str, Any]] = {}
     for name, values in arrays.items():
+        if values.dtype != np.float32:
+            raise InputError(f"{str(folder / FILE)!r}: {name} holds {values.dtype}; must be float32")
         band, _, key = name.partition(".")
         held.setdefault(int(band), {})[key] = floats(values) if values.size else None
     suns = tuple(parameters["suns"]) if parameters["suns"] else None
