@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import drjit as dr
@@ -132,9 +133,9 @@ class AtmosphereMedium:
         phase.use(self.air)
         self.m_is_homogeneous = False
         self.m_has_spectral_extinction = not wavelengths.achromatic
-        # What one call of sample_interaction hands on from one of the methods below to the next.
-        self._lowest: Any = None
-        self._bound: Any = None
+        # What one call of sample_interaction hands on from one of the methods below to the next. Scalar variants call
+        # from several threads.
+        self._handed = threading.local()
 
     def traverse(self, callback: Any) -> None:
         mi.Medium.traverse(self, callback)
@@ -145,19 +146,17 @@ class AtmosphereMedium:
         self.air.update()
 
     def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
-        hits, near, far, lowest = self.air.along(ray)
-        self._lowest = lowest
+        hits, near, far, self._handed.lowest = self.air.along(ray)
         return hits, near, far
 
     def get_majorant(self, mei: Any, active: Any = True) -> Any:
-        lowest, self._lowest = self._lowest, None
-        if lowest is None:  # asked outside of sample_interaction: nothing is known of the ray
-            lowest = mi.Float(0.0)
-        self._bound = self.air.majorant(lowest, mei) * (1.0 / self.air.scale)
-        return mi.UnpolarizedSpectrum(self._bound)
+        # Asked outside of sample_interaction, nothing is known of the ray.
+        lowest = vars(self._handed).pop("lowest", mi.Float(0.0))
+        bound_ = self._handed.bound = self.air.majorant(lowest, mei) * (1.0 / self.air.scale)
+        return mi.UnpolarizedSpectrum(bound_)
 
     def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        bound_, self._bound = self._bound, None
+        bound_ = vars(self._handed).pop("bound", None)
         if bound_ is None:
             bound_ = self.air.majorant(mi.Float(0.0), mei) * (1.0 / self.air.scale)
         value = self.air.pick(mei)

@@ -50,14 +50,14 @@ class AirPhase:
             nu = dr.select(rest >= below, self._cosine(c, g, sample2[0]), nu)
             below = below + share
         value, pdf = self._evaluate(parts, total, proposals, nu)
-        weight = value * dr.select(pdf > 0.0, 1.0 / pdf, 0.0)
-        return direction(mei, nu, sample2[1]), mi.Spectrum(weight), pdf
+        weight = value / dr.select(pdf > 0.0, pdf, 1.0)
+        return direction(mei, nu, sample2[1]), _scalar(weight), pdf
 
     def eval_pdf(self, ctx: Any, mei: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
         parts = self._parts(mei)
         total = parts_total(parts)
         value, pdf = self._evaluate(parts, total, self._proposals(parts, total), -dr.dot(wo, mei.wi))
-        return mi.Spectrum(value), pdf
+        return _scalar(value), pdf
 
     def _parts(self, mei: Any) -> list[tuple[Constituent, Any, Any]]:
         """Of every scatterer: scattering coefficient at the point (1/m) and g, unpolarised spectra."""
@@ -72,7 +72,8 @@ class AirPhase:
         from.
         """
         result = []
-        inverse = dr.detach(dr.select(total > 0.0, 1.0 / total, 0.0))
+        # Where nothing scatters the shares are 0; in scalar variants a division by zero is an exception.
+        inverse = dr.detach(1.0 / dr.select(total > 0.0, total, 1.0))
         for c, scattering, g in parts:
             share = dr.detach(scattering) * inverse
             if g is None:
@@ -91,7 +92,7 @@ class AirPhase:
         pdf = mi.Float(0.0)
         for share, c, g in proposals:
             pdf += share * self._density(c, g, nu)
-        return dr.select(total > 0.0, mixed / total, 0.0), pdf
+        return mixed / dr.select(total > 0.0, total, 1.0), pdf
 
     def _density(self, c: Constituent, g: Any, nu: Any) -> Any:
         if g is not None:
@@ -109,6 +110,13 @@ class AirPhase:
 
     def to_string(self) -> str:
         return f"AirPhase[{', '.join(f'{c.name}: {c.phase}' for _, c in self._scatterers)}]"
+
+
+def _scalar(value: Any) -> Any:
+    """The spectrum of an intensity without polarization, in polarized variants as a matrix of Mueller (made of the
+    array of four wavelengths itself, `mi.Spectrum` takes them for the matrix's four rows).
+    """
+    return mi.depolarizer(mi.UnpolarizedSpectrum(value))
 
 
 def parts_total(parts: list[tuple[Constituent, Any, Any]]) -> Any:

@@ -114,6 +114,56 @@ def test_where_rays_meet_the_air(rgb):
         assert not air.intersect_aabb(mi.Ray3f(mi.Point3f(0, 0, 400e3), mi.Vector3f(*direction)))[0][0]
 
 
+def test_rays_of_two_threads_keep_their_own_bounds(rgb):
+    """Scalar variants render with several threads, whose calls interleave."""
+    import threading
+
+    air = medium()
+    high, low = (mi.Ray3f(mi.Point3f(0, 0, h), mi.Vector3f(0, 0, 1)) for h in (20e3, 2.0))
+    mei = interaction([[0.0, 0.0, 2.0]])
+    air.intersect_aabb(low)
+    expected = air.get_majorant(mei)[0][0]
+    air.intersect_aabb(low)
+    other = threading.Thread(target=air.intersect_aabb, args=(high,))
+    other.start()
+    other.join()
+    assert air.get_majorant(mei)[0][0] == expected
+
+
+def test_phase_function_depolarizes(plugins):
+    """The air's scattering is that of intensities: unpolarized light comes out with the same four values."""
+
+    def found(variant):
+        mi.set_variant(variant)
+        plugins.register()
+        mei = dr.zeros(mi.MediumInteraction3f)
+        mei.p, mei.wi = mi.Point3f(0, 0, 100), mi.Vector3f(0, 0, -1)
+        mei.sh_frame, mei.wavelengths = mi.Frame3f(mei.wi), [400.0, 500.0, 600.0, 700.0]
+        phase, ctx = medium().phase_function(), mi.PhaseFunctionContext()
+        value, pdf = phase.eval_pdf(ctx, mei, mi.Vector3f(0.6, 0.0, 0.8))
+        _, weight, drawn = phase.sample(ctx, mei, 0.3, mi.Point2f(0.2, 0.7))
+        return np.array(value, dtype=float), np.array(weight, dtype=float), pdf, drawn
+
+    *plain, pdf, drawn = found("scalar_spectral")
+    *matrices, other_pdf, other_drawn = found("scalar_spectral_polarized")
+    assert (pdf, drawn) == (other_pdf, other_drawn)
+    for spectrum, matrix in zip(plain, matrices, strict=True):
+        expected = np.zeros((4, 4, 4))
+        expected[0, 0] = spectrum
+        np.testing.assert_array_equal(matrix, expected)
+
+
+def test_phase_function_where_nothing_scatters(plugins):
+    """Scalar variants raise an exception for a division by zero."""
+    mi.set_variant("scalar_rgb")
+    plugins.register()
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.wi = mi.Point3f(0, 0, 90e3), mi.Vector3f(0, 0, -1)
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    value, pdf = medium().phase_function().eval_pdf(mi.PhaseFunctionContext(), mei, mi.Vector3f(0.6, 0.0, 0.8))
+    assert np.all(np.array(value) == 0.0) and pdf == 0.0
+
+
 def test_phase_function_mixes_per_wavelength(rgb):
     """Rayleigh and aerosol, each in proportion to what it scatters at that altitude and wavelength."""
     from atmo_jit import Atmosphere
