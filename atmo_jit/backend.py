@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from . import noted
 from ._trees import flat, like
 from .errors import InputError
 
@@ -166,7 +167,8 @@ class Keeper:
     def kept(self, key: Any, make: Callable[[], Any]) -> Any:
         """What ``make`` returns, made once."""
         if key not in self._kept:
-            self._kept[key] = make()
+            with noted.apart():
+                self._kept[key] = make()
         return self._kept[key]
 
 
@@ -181,12 +183,24 @@ def table(values: Any) -> Any:
 
 def stored(values: Sequence[Any], lane: Any, size: int) -> Any:
     """A few Floats as one buffer [lane, size], evaluated; zeros where there are fewer than ``size``."""
-    return evaluated(_scattered(values, lane, size))
+    return _stored([values], lane, [size])[0]
 
 
 def tables_of(groups: Sequence[Sequence[Any]], lane: Any) -> list[Any]:
     """Each group of Floats as a table of rows, one per lane, evaluated together: in one kernel."""
-    return evaluated([_scattered(values, lane, row_size(len(values))) for values in groups])
+    return _stored(groups, lane, [row_size(len(values)) for values in groups])
+
+
+def _stored(groups: Sequence[Sequence[Any]], lane: Any, sizes: list[int]) -> list[Any]:
+    import drjit as dr
+
+    known = noted.take(len(sizes))
+    if known is None:
+        return evaluated([_scattered(values, lane, size) for values, size in zip(groups, sizes, strict=True)])
+    if not dr.grad_enabled(groups):
+        return known
+    zero = dr.zeros(types().Float, dr.width(lane))
+    return dr.custom(_operations()[1], [[value + zero for value in values] for values in groups], lane, sizes, known)
 
 
 def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
@@ -203,6 +217,7 @@ def evaluated(buffer: Any) -> Any:
     """A Float that later kernels gather from: evaluated now, and so are its derivatives when they come by.
 
     Several Floats in a list are evaluated together, in one kernel if they are of one width; so are their derivatives.
+    Where they are known (noted.knowing) they are not computed, and only derivatives are.
 
     Dr.Jit leaves the derivatives of a gather or scatter pending, and a loop that reads them while it is traced aborts
     the process ("dirty variable").
@@ -211,18 +226,24 @@ def evaluated(buffer: Any) -> Any:
 
     if not isinstance(buffer, list):
         return evaluated([buffer])[0]
-    dr.eval(buffer)
-    return together(buffer)
+    known = noted.take(len(buffer))
+    if known is None:
+        dr.eval(buffer)
+        noted.note(buffer)
+    return together(buffer, known)
 
 
-def together(values: list[Any]) -> list[Any]:
+def together(values: list[Any], known: list[Any] | None = None) -> list[Any]:
     """The same Floats, whose derivatives are evaluated together when they come by: in one kernel if they are of one
-    width. One by one, each would run everything that they have in common once more."""
+    width. One by one, each would run everything that they have in common once more. ``known``: their values."""
     import drjit as dr
 
-    values, places = list(values), [i for i, value in enumerate(values) if dr.grad_enabled(value)]
+    places = [i for i, value in enumerate(values) if dr.grad_enabled(value)]
+    given = [values[i] for i in places]
+    values = list(known or values)
     if places:
-        for i, value in zip(places, dr.custom(_together(), [values[i] for i in places]), strict=True):
+        new = dr.custom(_operations()[0], given, [values[i] for i in places] if known else None)
+        for i, value in zip(places, new, strict=True):
             values[i] = value
     return values
 
@@ -279,12 +300,12 @@ def traversing() -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _together() -> type:
+def _operations() -> tuple[type, type]:
     import drjit as dr
 
     class Together(dr.CustomOp):
-        def eval(self, values: list[Any]) -> list[Any]:
-            return list(values)
+        def eval(self, values: list[Any], known: list[Any] | None) -> list[Any]:
+            return list(known or values)
 
         def forward(self) -> None:
             grads = self.grad_in("values")
@@ -299,4 +320,24 @@ def _together() -> type:
         def name(self) -> str:
             return "together"
 
-    return Together
+    class Stored(dr.CustomOp):
+        def eval(self, groups: list[list[Any]], lane: Any, sizes: list[int], known: list[Any]) -> list[Any]:
+            self.lane, self.sizes, self.counts = lane, sizes, [len(values) for values in groups]
+            return known
+
+        def forward(self) -> None:
+            steps = zip(self.grad_in("groups"), self.sizes, strict=True)
+            grads = [_scattered(values, self.lane, size) for values, size in steps]
+            dr.eval(grads)
+            self.set_grad_out(grads)
+
+        def backward(self) -> None:
+            grads = self.grad_out()
+            dr.eval(grads)
+            rows = [packet(grad, self.lane, size) for grad, size in zip(grads, self.sizes, strict=True)]
+            self.set_grad_in("groups", [values[:n] for values, n in zip(rows, self.counts, strict=True)])
+
+        def name(self) -> str:
+            return "stored"
+
+    return Together, Stored

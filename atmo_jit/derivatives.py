@@ -257,13 +257,19 @@ class Linearization:
     def _optics(self) -> list[Optics]:
         return [band.optics for band in self.sky.solutions]
 
+    @property
+    def _solved(self) -> list[dict[str, Any]]:
+        """What is taken over from the solve, per band."""
+        fields = [band.field for band in self.sky.solutions]
+        return [{"shares": field.shares, "known": field.known} for field in fields]
+
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:
-        """What Evaluation takes beside values: views, pieces of their rays, shares of the orders."""
+        """What Evaluation takes beside values: views, pieces of their rays, what is taken over from the solve."""
         views = {name: doubles(values) for name, values in self.views.items()}
         rays, _, _ = self.sky.enter(*where(views))
         pieces = [Pieces.of(optics, rays) for optics in self._optics]
-        return views, pieces, [band.field.shares for band in self.sky.solutions]
+        return views, pieces, self._solved
 
     @cached_property
     def _product(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -287,13 +293,14 @@ class Linearization:
             return self._evaluation, self._arguments
         views = {name: doubles(values[:1]) for name, values in self.views.items()}
         place = (self.views["altitude_m"][0], np.radians(self.views["sun_zenith_deg"][0]))
-        shares = [band.field.shares for band in self.sky.solutions]
-        return TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product)), (views, None, shares)
+        table = TableEvaluation(self.sky, self._options, *place, *map(np.radians, self._product))
+        return table, (views, None, self._solved)
 
     @cached_property
     def _evaluation(self) -> Evaluation:
-        views, pieces, shares = self._arguments
-        sizes = [dr.width(views["altitude_m"]), *(part and part.count for part in pieces), *map(len, shares)]
+        views, pieces, solved = self._arguments
+        sizes = [dr.width(views["altitude_m"]), *(part and part.count for part in pieces)]
+        sizes += [len(band["shares"]) for band in solved]
         key = [tuple(views), *sizes, *self._options.values(), *self._solving.values()]
         key += [(optics.make_up, optics.phase_kinds) for optics in self._optics]
         return self.sky.grid.kept(("evaluation", *key), lambda: Evaluation(self.sky, self._options))

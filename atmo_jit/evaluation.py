@@ -18,7 +18,8 @@ OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
 
 
 class Evaluation:
-    """The outputs of a sky as a function of values, views, pieces of their rays, and shares of the orders.
+    """The outputs of a sky as a function of values, views, pieces of their rays, and what the solve left: shares of the
+    orders, and tables that are known.
 
     It and its derivatives are recorded (dr.freeze) where they are asked for more than once: tracing costs several
     times what running does.
@@ -43,11 +44,11 @@ class Evaluation:
         them the weights, Floats [N] in the order of the outputs."""
         *arrays, of_values, of_views = arguments
 
-        def function(values: Any, views: Any, pieces: Any, shares: Any, weights: Any) -> tuple[Any, Any]:
+        def function(values: Any, views: Any, pieces: Any, solved: Any, weights: Any) -> tuple[Any, Any]:
             values, views = copied(values), copied(views)
             wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
             dr.enable_grad(wanted)
-            outputs = self._outputs(values, views, pieces, shares)
+            outputs = self._outputs(values, views, pieces, solved)
             pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
             for output, weight in pairs:
                 dr.set_grad(output, weight)
@@ -63,8 +64,8 @@ class Evaluation:
         with traversing():
             return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
 
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], shares: list[Any]) -> list[Any]:
-        sky = self._sky.again(values, shares)
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], solved: list[Any]) -> list[Any]:
+        sky = self._again(values, solved)
         place = where(views)
         light = sky.rays(*place, **self._options, pieces=pieces)
         sun, scattered = sky.irradiance(place[0], place[1])
@@ -73,8 +74,11 @@ class Evaluation:
         dr.eval(outputs)
         return outputs
 
+    def _again(self, values: list[Any], solved: list[Any]) -> Sky:
+        return self._sky.again(values, *([band[name] for band in solved] for name in ("shares", "known")))
+
     def _forward(
-        self, values: Any, views: Any, pieces: Any, shares: Any, along_values: Any, along_views: Any
+        self, values: Any, views: Any, pieces: Any, solved: Any, along_values: Any, along_views: Any
     ) -> tuple[list[Any], list[Any]]:
         values, views = copied(values), copied(views)
         pairs = [pair for name in along_views or () for pair in [(views[name], along_views[name])]]
@@ -82,7 +86,7 @@ class Evaluation:
             pairs += [pair for name in steps for pair in zip(flat(made[name]), flat(steps[name]), strict=True)]
         for leaf, _ in pairs:
             dr.enable_grad(leaf)
-        outputs = self._outputs(values, views, pieces, shares)
+        outputs = self._outputs(values, views, pieces, solved)
         for leaf, step in pairs:
             dr.set_grad(leaf, step)
         dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in pairs))
@@ -109,8 +113,8 @@ class TableEvaluation(Evaluation):
         self._recorded = False
         self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
 
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, shares: list[Any]) -> list[Any]:
-        t, sky = types(), self._sky.again(values, shares)
+    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, solved: list[Any]) -> list[Any]:
+        t, sky = types(), self._again(values, solved)
         altitude, sun_zenith = self._place
         ground = self._options["ground"]
         light = sky.table(altitude, self._view_zenith, sun_zenith, self._azimuth, ground=ground)

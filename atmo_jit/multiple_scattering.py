@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from . import noted
 from .backend import floats
 from .column import SunColumns
 from .field import Field
@@ -34,19 +35,27 @@ AT_ONCE = 4  # orders computed before the sum is first extrapolated
 
 
 def solve(
-    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, orders: int | None, tolerance: float
+    optics: Optics,
+    columns: SunColumns,
+    grid: Grid,
+    resolution: Resolution,
+    orders: int | None,
+    tolerance: float,
+    *,
+    noting: bool = False,
 ) -> Field:
     """The field of the light of all orders below ``orders``: what may scatter or reflect once more on the way to an
     observer.
 
     ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
     soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
+    ``noting``: the field gets what ``solve_again`` need not compute once more, Field.known.
     """
     steps = _Steps.of(optics, columns, grid, resolution)
     most = orders or resolution.orders
     values = optics.values(resolution.degrees, resolution.phase_degree)
-    done = steps.start(values, min(AT_ONCE, most))
-    later = done["later"]
+    done = steps.start(values, min(AT_ONCE, most), noting=noting)
+    later, tables = done["later"], [done["tables"]]
     probes = [steps.probe(light, done, n) for n, light in enumerate(later, 2)]
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
     for n in range(AT_ONCE, most + 1):
@@ -54,13 +63,15 @@ def solve(
             new, error = _extrapolated(np.stack(probes))
             if n > STEADY and not np.isfinite(error):
                 later.pop()
+                tables.pop()
                 break
             weights = arriving = new
             if error < resolution.converged * tolerance:
                 break
         if n == most:
             break
-        later.append(steps.step(values, done, later[-1], n + 1))
+        later.append(steps.step(values, done, later[-1], n + 1, noting=noting))
+        tables.append(done["tables"])
         probes.append(steps.probe(later[-1], done, n + 1))
     if orders is not None and later:
         arriving = np.ones((len(later), grid.shape[1], optics.channel_count))
@@ -68,18 +79,27 @@ def solve(
         weights[-1] = 0.0
     shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
     parts = steps.finish(values, done, later, shares)
-    return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
+    field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
+    if noting:
+        field.known = {"reference": done["reference"], "tables": [table for some in tables for table in some]}
+    return field
 
 
 def solve_again(
-    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, shares: list[Any], orders: int | None
+    optics: Optics,
+    columns: SunColumns,
+    grid: Grid,
+    resolution: Resolution,
+    shares: list[Any],
+    orders: int | None,
+    known: dict[str, Any] | None = None,
 ) -> Field:
-    """The same for values of the optics that carry derivatives, given the ``shares`` of a field that was solved:
-    nothing in here waits for a result."""
+    """The same for values of the optics that carry derivatives, given the ``shares`` of a field that was solved, and
+    what is ``known`` from it if it was solved for these very values: nothing in here waits for a result."""
     values = optics.values(resolution.degrees, resolution.phase_degree)
     optics = optics.with_values(values)
     steps = _Steps(optics, columns, grid, resolution)
-    done = steps.started(values, len(shares) + 1)
+    done = steps.started(values, len(shares) + 1, known)
     parts = steps.finished(
         values, done["reference"], done["first"], done["later"], shares, extrapolated=orders is None
     )
@@ -141,19 +161,30 @@ class _Steps:
             return cls(optics, columns, grid, resolution)
         return grid.kept(("steps", optics.make_up), lambda: cls(optics, columns, grid, resolution))
 
-    def start(self, values: Any, count: int) -> dict[str, Any]:
-        """Orders 1 to ``count``, the reference, and what the next order needs."""
-        return self._run(("start", count), lambda v: self.started(v, count), values)
+    def start(self, values: Any, count: int, *, noting: bool) -> dict[str, Any]:
+        """Orders 1 to ``count``, the reference, what the next order needs, and all tables if they are noted."""
 
-    def step(self, values: Any, done: dict[str, Any], light: Any, n: int) -> Any:
+        def start(values: Any) -> dict[str, Any]:
+            with noted.noting() as tables:
+                done = self.started(values, count)
+            return {**done, "tables": tables if noting else []}
+
+        return self._run(("start", count, noting), start, values)
+
+    def step(self, values: Any, done: dict[str, Any], light: Any, n: int, *, noting: bool) -> Any:
         """Order ``n`` from the one before."""
         stage, before = self._stage(n), self._stage(n - 1)
         if stage != before or n == 2:
             done["gather"] = None
-        key = ("step", stage, before, n == 2, done["gather"] is None)
-        light, done["gather"] = self._run(
-            key,
-            lambda v, reference, gather, light: self._step(v, reference, gather, light, n),
+
+        def step(*arguments: Any) -> tuple[Any, ...]:
+            with noted.noting() as tables:
+                light, gather = self._step(*arguments, n)
+            return light, gather, tables if noting else []
+
+        light, done["gather"], done["tables"] = self._run(
+            ("step", stage, before, n == 2, done["gather"] is None, noting),
+            step,
             values,
             done["reference"],
             done["gather"],
@@ -199,13 +230,20 @@ class _Steps:
         r = self._resolution
         return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
 
-    def started(self, values: Any, count: int) -> dict[str, Any]:
+    def started(self, values: Any, count: int, known: dict[str, Any] | None = None) -> dict[str, Any]:
         """The same, traced."""
+        if known is None:
+            return self._started(values, count, None)
+        with noted.knowing(known["tables"]):
+            return self._started(values, count, known["reference"])
+
+    def _started(self, values: Any, count: int, held: dict[str, Any] | None) -> dict[str, Any]:
         optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
         suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
         project = Projection.at(grid, fine, *self._degree(1))
         first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
-        reference = Reference.above(grid, first)
+        with noted.apart():
+            reference = Reference.above(grid, first) if held is None else Reference.of(grid, first.channels, held)
         later, light, gather = [], first, None
         for n in range(2, count + 1):
             if n > 2 and self._stage(n) != self._stage(n - 1):

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from . import noted
 from .backend import row, sum_loop, table, table_of, tables_of, types
 from .optics import Optics
 from .paths import Paths, Points, points_along
@@ -34,7 +35,8 @@ def columns_along(optics: Optics, points: Points) -> Columns:
         empty = dr.zeros(types().Float, 8)
         return Columns(empty, empty, empty)
     if optics.profiles_differentiable:
-        return _traced_columns(optics, points)
+        with noted.apart():
+            return _traced_columns(optics, points)
     return points.paths.kept(("columns", points.nodes), lambda: _columns(optics, points))
 
 

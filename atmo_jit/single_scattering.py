@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from . import noted
 from .backend import (
     floats,
     not_negative,
@@ -61,7 +62,8 @@ class Sunbeam:
             return table_of([seen, *columns.toward(h, mu_s)], lane)
 
         if optics.profiles_differentiable:
-            held = beams()
+            with noted.apart():
+                held = beams()
         else:
             keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
             held = keeper.kept(("sunbeams", paths.refine), beams)

@@ -111,7 +111,7 @@ class Sky:
             optics = Optics(self.atmosphere, band, scattering_too)
             if values is None:
                 columns = sun_columns(optics, self.grid)
-                field = solve(optics, columns, self.grid, self.resolution, orders, remainder)
+                field = solve(optics, columns, self.grid, self.resolution, orders, remainder, noting=sure)
             else:
                 columns = SunColumns(optics, self.resolution.columns, values["columns"])
                 degree = self.resolution.first_degree
@@ -123,14 +123,18 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns)
 
-    def again(self, values: list[dict[str, Any]], shares: list[Any]) -> Sky:
+    def again(
+        self, values: list[dict[str, Any]], shares: list[Any], known: list[dict[str, Any] | None] | None = None
+    ) -> Sky:
         """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
-        of orders (Field) of a sky that was solved, on the same nodes."""
+        of orders (Field) of a sky that was solved, on the same nodes; ``known`` (Field): from a solve for the same
+        values."""
         other, other._bands = copy(self), []
-        for band, new, of_orders in zip(self._bands, values, shares, strict=True):
+        of_bands = zip(self._bands, values, shares, known or [None] * len(shares), strict=True)
+        for band, new, of_orders, of_solve in of_bands:
             optics = band.optics.with_values(new)
             columns = sun_columns(optics, self.grid)
-            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders)
+            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders, of_solve)
             other._bands.append(_Band(field.optics, columns, field))
         return other
 
