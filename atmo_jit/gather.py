@@ -12,6 +12,7 @@ moments of a higher m than the result keeps are left out, of whatever degree the
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -28,6 +29,7 @@ from .paths import Directions, Paths, paths_along
 from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
+from .transposed import Readers, by_moments, by_table, by_weights, multilinear
 
 FAINT = 1e-15  # light of which no quotient is made: a derivative has its square below the line
 
@@ -56,6 +58,13 @@ class Samples:
         nu = dr.fma(mu0, mu_s, safe_sine(mu0) * sin_s * cos_phi)
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
         self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
+        self._shape = len(paths.station), suns * azimuths
+        self._suns = suns
+
+    @cached_property
+    def readers(self) -> Readers:
+        """Who reads each sun of a table of all visits."""
+        return Readers(self.place.numpy().reshape(*self._shape, 2)[..., 0], self._suns)
 
 
 class Gather:
@@ -95,13 +104,26 @@ class Gather:
 
     def __call__(self, light: Moments) -> Any:
         """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
-        t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
+        channels, suns = self.optics.channel_count, self.grid.shape[1]
         orders = min(light.most, self.most) + 1
         weights = weight_rows(
             self.optics, self.paths, self.held["scattered"], self.held["reflected"], light.degree, orders
         )
         table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
-        device, per_visit = self.paths.device, suns * azimuths
+        per_visit = suns * self.azimuths
+
+        def transposed(grad: Any, _: int, __: Any) -> Any:
+            of_samples = self.samples.place, self.held["scale"]
+            readers = self.samples.readers
+            return by_table(readers, self.paths, *of_samples, grad, per_visit, suns, orders, channels)
+
+        radiance = multilinear(lambda table: self._radiance(table, orders, channels), transposed, table)
+        return self._harmonics(radiance)
+
+    def _radiance(self, table: Any, orders: int, channels: int) -> Any:
+        """Radiance at the nodes, [rays, S, azimuths, 4], from the table of ``contracted``."""
+        t, suns, device = types(), self.grid.shape[1], self.paths.device
+        per_visit = suns * self.azimuths
         lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
         ray, sample = lane // per_visit, lane % per_visit
         start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
@@ -116,8 +138,7 @@ class Gather:
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
         _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, max_iterations=-1, label="gather")
-        radiance = stored(sums, lane, 4)
-        return self._harmonics(radiance)
+        return stored(sums, lane, 4)
 
     def _harmonics(self, radiance: Any) -> Any:
         t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
@@ -209,7 +230,19 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
 def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int, orders: int, channels: int) -> Any:
     """G, table [visits, suns, m x channels]: ``moments`` [K, suns, l, m x channels] seen along each path, weighed by
     ``weights`` [visits, l, m x channels] and summed over l."""
-    t, rows, width = types(), degree + 2, orders * channels
+    rows, width = degree + 2, orders * channels
+
+    def transposed(grad: Any, number: int, moments: Any, weights: Any) -> Any:
+        if number:
+            return by_weights(paths, grad, moments, suns, rows, width)
+        nodes = dr.width(moments) // (suns * rows * row_size(width))
+        return by_moments(paths, grad, weights, nodes, suns, rows, width)
+
+    return multilinear(lambda *both: _contracted(paths, *both, suns, rows, width), transposed, moments, weights)
+
+
+def _contracted(paths: Paths, moments: Any, weights: Any, suns: int, rows: int, width: int) -> Any:
+    t = types()
     lane = dr.arange(t.UInt, len(paths.station) * suns)
     sun, visit = lane % suns, lane // suns
     node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun

@@ -1,0 +1,151 @@
+"""Derivatives backwards through the gather's sums (gather.py), as gathers in the other direction.
+
+Dr.Jit turns what a kernel gathers around, into additions to memory that several lanes share, for which every thread
+needs a copy of the table. Who reads an entry is geometry, known beforehand: so here every entry collects what its
+readers have for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .backend import floats, packet, row, table_of, types, uints
+from .paths import Paths
+from .projection import add_harmonics
+
+
+def multilinear(function: Callable[..., Any], transposed: Callable[..., list[Any]], *inputs: Any) -> Any:
+    """``function`` of Floats in each of which it is linear. ``transposed``: the derivative by one of them, given
+    that by the result, the number of the input, and the inputs."""
+    if not dr.grad_enabled(inputs):
+        return function(*inputs)
+    wanted = [dr.grad_enabled(value) for value in inputs]
+    return dr.custom(_Multilinear, list(inputs), function, transposed, wanted)
+
+
+class _Multilinear(dr.CustomOp):
+    def eval(self, inputs: list[Any], function: Any, transposed: Any, wanted: list[bool]) -> Any:
+        self.inputs, self.function, self.transposed, self.wanted = list(inputs), function, transposed, wanted
+        return function(*inputs)
+
+    def forward(self) -> None:
+        steps, total = self.grad_in("inputs"), 0.0
+        for i in (i for i, wanted in enumerate(self.wanted) if wanted):
+            dr.eval(steps[i])
+            total = total + self.function(*self.inputs[:i], steps[i], *self.inputs[i + 1 :])
+        dr.eval(total)
+        self.set_grad_out(total)
+
+    def backward(self) -> None:
+        grad = self.grad_out()
+        dr.eval(grad)
+        grads = [
+            self.transposed(grad, i, *self.inputs) if wanted else dr.zeros(type(value), dr.width(value))
+            for i, (value, wanted) in enumerate(zip(self.inputs, self.wanted, strict=True))
+        ]
+        self.set_grad_in("inputs", grads)
+
+    def name(self) -> str:
+        return "multilinear"
+
+
+def by_moments(paths: Paths, grad: Any, weights: Any, nodes: int, suns: int, rows: int, width: int) -> Any:
+    """Derivative by the moments that gather.contracted reads, table [nodes, suns, l, width]: sums over the visits at a
+    node's level of derivative ``grad`` [visits, suns, width] times weight."""
+    t = types()
+
+    def at_levels() -> tuple[Any, Any]:
+        order = np.argsort(paths.level, kind="stable")
+        return uints(order), uints(np.searchsorted(paths.level[order], np.arange(nodes + 1)))
+
+    order, first = paths.kept(("visits at levels", nodes), at_levels)
+    lane = dr.arange(t.UInt, nodes * suns * rows)
+    size, per_level = dr.opaque(t.UInt, rows, 1), dr.opaque(t.UInt, suns, 1)
+    node = lane // size
+    l_, level = lane - node * size, node // per_level
+    sun = node - level * per_level
+    start, stop = (dr.gather(t.UInt, first, level + i) for i in (0, 1))
+
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        visit = dr.gather(t.UInt, order, i)
+        parts = row(grad, visit * per_level + sun, width), row(weights, visit * size + l_, width)
+        return i + 1, [dr.fma(a, b, s) for a, b, s in zip(*parts, sums, strict=True)]
+
+    return _summed(add, start, stop, width, lane)
+
+
+def by_weights(paths: Paths, grad: Any, moments: Any, suns: int, rows: int, width: int) -> Any:
+    """The same by the weights, table [visits, l, width]: sums over suns."""
+    t = types()
+    lane = dr.arange(t.UInt, len(paths.station) * rows)
+    size, per_level = dr.opaque(t.UInt, rows, 1), dr.opaque(t.UInt, suns, 1)
+    visit = lane // size
+    l_, node = lane - visit * size, dr.gather(t.UInt, paths.device.level, visit) * per_level
+
+    def add(sun: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        parts = row(grad, visit * per_level + sun, width), row(moments, (node + sun) * size + l_, width)
+        return sun + 1, [dr.fma(a, b, s) for a, b, s in zip(*parts, sums, strict=True)]
+
+    return _summed(add, t.UInt(0), per_level, width, lane)
+
+
+class Readers:
+    """Who reads each row of a table [visits, suns + 2, m x channels], cubically at the sun coordinates ``x`` [visits,
+    samples]: per row, from ``first``, the sample and its weight."""
+
+    def __init__(self, x: np.ndarray, suns: int) -> None:
+        visits, samples = x.shape
+        s = np.minimum(x.astype(np.int64), suns - 2)
+        f = x - s.astype(np.float32)
+        g = np.float32(1.0) - f
+        weights = np.stack(
+            [-0.5 * f * g * g, f * f * (1.5 * f - 2.5) + 1.0, g * g * (1.5 * g - 2.5) + 1.0, -0.5 * g * f * f], axis=-1
+        )
+        rows = (np.arange(visits)[:, None] * (suns + 2) + s)[..., None] + np.arange(4)
+        sample = np.broadcast_to(np.arange(samples)[:, None], rows.shape)
+        read = weights != 0.0
+        rows, weights, sample = rows[read], weights[read], sample[read]
+        order = np.argsort(rows, kind="stable")
+        self.readers = floats(np.column_stack([sample[order], weights[order]]))
+        self.first = uints(np.searchsorted(rows[order], np.arange(visits * (suns + 2) + 1)))
+
+
+def by_table(
+    readers: Readers,
+    paths: Paths,
+    place: Any,
+    scale: Any,
+    grad: Any,
+    samples: int,
+    suns: int,
+    orders: int,
+    channels: int,
+) -> Any:
+    """Derivative by the table that Gather reads, [visits, suns + 2, m x channels], from ``grad`` [rays, samples, 4] by
+    radiance; ``place`` and ``scale``: of Gather's samples."""
+    t = types()
+    lane, width = dr.arange(t.UInt, len(paths.station) * (suns + 2)), orders * channels
+    visit = lane // (suns + 2)
+    ray = dr.gather(t.UInt, paths.device.ray, visit)
+    start, stop = (dr.gather(t.UInt, readers.first, lane + i) for i in (0, 1))
+
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        which, weight = packet(readers.readers, i, 2)
+        sample = t.UInt(which)
+        _, cos_phi = packet(place, visit * samples + sample, 2)
+        parts = packet(scale, visit * samples + sample, 4), packet(grad, ray * samples + sample, 4)
+        values = [weight * a * b for a, b in zip(*parts, strict=True)][:channels]
+        return i + 1, add_harmonics(sums, values, cos_phi)
+
+    return _summed(add, start, stop, width, lane)
+
+
+def _summed(add: Callable[..., Any], start: Any, stop: Any, width: int, lane: Any) -> Any:
+    zero = [dr.zeros(types().Float, dr.width(lane)) for _ in range(width)]
+    _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
+    return table_of(sums, lane)
+
