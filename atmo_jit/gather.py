@@ -114,8 +114,7 @@ class Gather:
 
         def transposed(grad: Any, _: int, __: Any) -> Any:
             of_samples = self.samples.place, self.held["scale"]
-            readers = self.samples.readers
-            return by_table(readers, self.paths, *of_samples, grad, per_visit, suns, orders, channels)
+            return by_table(self.samples.readers, self.paths, *of_samples, grad, per_visit, suns, orders, channels)
 
         radiance = multilinear(lambda table: self._radiance(table, orders, channels), transposed, table)
         return self._harmonics(radiance)

@@ -110,7 +110,7 @@ class Readers:
         read = weights != 0.0
         rows, weights, sample = rows[read], weights[read], sample[read]
         order = np.argsort(rows, kind="stable")
-        self.readers = floats(np.column_stack([sample[order], weights[order]]))
+        self.table = floats(np.column_stack([sample[order], weights[order]]))
         self.first = uints(np.searchsorted(rows[order], np.arange(visits * (suns + 2) + 1)))
 
 
@@ -126,26 +126,28 @@ def by_table(
     channels: int,
 ) -> Any:
     """Derivative by the table that Gather reads, [visits, suns + 2, m x channels], from ``grad`` [rays, samples, 4] by
-    radiance; ``place`` and ``scale``: of Gather's samples."""
-    t = types()
-    lane, width = dr.arange(t.UInt, len(paths.station) * (suns + 2)), orders * channels
-    visit = lane // (suns + 2)
+    radiance; ``place`` and ``scale`` are those of gather.Samples and Gather."""
+    t, visits = types(), len(paths.station)
+    lane = dr.arange(t.UInt, visits * samples)
+    visit = lane // samples
     ray = dr.gather(t.UInt, paths.device.ray, visit)
+    parts = packet(scale, lane, 4), packet(grad, ray * samples + lane - visit * samples, 4)
+    values = [a * b for a, b in zip(*parts, strict=True)][:channels]
+    scaled = table_of([packet(place, lane, 2)[1], *values], lane)
+
+    lane = dr.arange(t.UInt, visits * (suns + 2))
+    first = lane // (suns + 2) * samples
     start, stop = (dr.gather(t.UInt, readers.first, lane + i) for i in (0, 1))
 
     def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        which, weight = packet(readers.readers, i, 2)
-        sample = t.UInt(which)
-        _, cos_phi = packet(place, visit * samples + sample, 2)
-        parts = packet(scale, visit * samples + sample, 4), packet(grad, ray * samples + sample, 4)
-        values = [weight * a * b for a, b in zip(*parts, strict=True)][:channels]
-        return i + 1, add_harmonics(sums, values, cos_phi)
+        sample, weight = packet(readers.table, i, 2)
+        cos_phi, *values = row(scaled, first + t.UInt(sample), channels + 1)
+        return i + 1, add_harmonics(sums, [weight * value for value in values], cos_phi)
 
-    return _summed(add, start, stop, width, lane)
+    return _summed(add, start, stop, orders * channels, lane)
 
 
 def _summed(add: Callable[..., Any], start: Any, stop: Any, width: int, lane: Any) -> Any:
     zero = [dr.zeros(types().Float, dr.width(lane)) for _ in range(width)]
     _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
     return table_of(sums, lane)
-
