@@ -151,35 +151,47 @@ class Linearization:
         if unknown:
             raise InputError(f"cotangents: {unknown[0]!r} is no output; allowed are {', '.join(OUTPUTS)}")
         shape = self.rays, len(self.atmosphere.wavelengths_nm)
-        weights = [np.broadcast_to(np.asarray(cotangents.get(name, 0.0), np.float32), shape) for name in OUTPUTS]
+        given = {name: np.broadcast_to(np.asarray(c, np.float32), shape) for name, c in cotangents.items() if np.any(c)}
+        # An output without weight is not followed back.
+        weights = {name: given[name] for name in OUTPUTS if name in given} or {OUTPUTS[0]: np.zeros(shape, np.float32)}
         of_values = sorted({group for name in names for group in self._groups(name)})
         of_views = sorted(set(names) & set(VIEWS))
         adjoints: tuple[Any, Any] = [], {}
         if of_values or of_views:
-            columns = [floats(column) for column in np.concatenate(weights, axis=-1).T]
+            columns = {name: [floats(column) for column in of_output.T] for name, of_output in weights.items()}
             evaluation, arguments = self._evaluating(by_views=bool(of_views))
             adjoints = evaluation.reverse(self._made, *arguments, columns, of_values, of_views)
+        # While the kernels run.
+        steps = {name: self._steps(name) for name in names if name not in RADII and name not in VIEWS}
         found = {name: adjoints[1][name].numpy() for name in of_views}
         host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints[0]]
         for name in names:
             if name in RADII:
                 change = self._by_radius(name)
-                found[name] = np.sum([np.vdot(w, change[o]) for w, o in zip(weights, OUTPUTS, strict=True)])
+                found[name] = np.sum([np.vdot(w, change[o]) for o, w in weights.items()])
             elif name not in VIEWS:
-                found[name] = self._pulled_back(name, host)
+                found[name] = self._pulled_back(name, steps[name], host)
         return found
 
-    def _pulled_back(self, name: str, adjoints: list[dict[str, list[np.ndarray]]]) -> np.ndarray:
-        """Derivative by a parameter from those by the values of every band.
+    def _steps(self, name: str) -> list[dict[str, Any]]:
+        """How the values of every band change with a parameter.
 
         Channels do not mix between a parameter and the values, nor do nodes of a profile: one step of all of them
         serves each.
         """
+        along = np.ones_like(described(self.atmosphere, name))
+        return [
+            like(numbers, tangent(optics, name, along, self._degrees, self._phase_degree))
+            for optics, numbers in zip(self._optics, self._numbers, strict=True)
+        ]
+
+    def _pulled_back(
+        self, name: str, of_bands: list[dict[str, Any]], adjoints: list[dict[str, list[np.ndarray]]]
+    ) -> np.ndarray:
+        """Derivative by a parameter, from how the values of every band change with it and the derivatives by those."""
         value, nodes = described(self.atmosphere, name), ".profile." in name
         found = np.zeros(np.shape(value))
-        for optics, numbers, adjoint in zip(self._optics, self._numbers, adjoints, strict=True):
-            step = tangent(optics, name, np.ones_like(value), self._degrees, self._phase_degree)
-            steps = like(numbers, step)
+        for optics, steps, adjoint in zip(self._optics, of_bands, adjoints, strict=True):
             for group in self._groups(name):
                 along = flat(steps[group])
                 parts = [grad.reshape(len(d), -1)[:, : d.shape[1]] if d.ndim == 2 else grad.reshape(d.shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import drjit as dr
@@ -41,15 +41,16 @@ class Evaluation:
 
     def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
-        them the weights, Floats [N] in the order of the outputs."""
+        them the weights, W Floats [N] by output."""
         *arrays, of_values, of_views = arguments
+        weighted = tuple(arrays[-1])
 
         def function(values: Any, views: Any, pieces: Any, solved: Any, weights: Any) -> tuple[Any, Any]:
             values, views = copied(values), copied(views)
             wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
             dr.enable_grad(wanted)
-            outputs = self._outputs(values, views, pieces, solved)
-            pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
+            outputs = self._outputs(values, views, pieces, solved, weighted)
+            pairs = [(v, w) for v, w in zip(outputs, flat(weights), strict=True) if dr.grad_enabled(v)]
             for output, weight in pairs:
                 dr.set_grad(output, weight)
             dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
@@ -58,21 +59,26 @@ class Evaluation:
             dr.eval(adjoints)
             return adjoints
 
-        return self._run(("reverse", *of_values, *of_views), function, *arrays)
+        return self._run(("reverse", weighted, *of_values, *of_views), function, *arrays)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():
             return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
 
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: list[Any], solved: list[Any]) -> list[Any]:
+    def _outputs(
+        self,
+        values: list[Any],
+        views: dict[str, Any],
+        pieces: list[Any],
+        solved: list[Any],
+        wanted: Collection[str] = OUTPUTS,
+    ) -> list[Any]:
         sky = self._again(values, solved)
         place = where(views)
         light = sky.rays(*place, **self._options, pieces=pieces)
-        sun, scattered = sky.irradiance(place[0], place[1])
+        horizontal = sky.irradiance(*place[:2]) if set(wanted) & set(OUTPUTS[2:]) else ([], [])
         zero = dr.zeros(types().Float, dr.width(place[0]))
-        outputs = [v + zero for v in (*light.radiance, *light.transmittance, *sun, *scattered)]
-        dr.eval(outputs)
-        return outputs
+        return _wanted(wanted, light.radiance, light.transmittance, *horizontal, zero)
 
     def _again(self, values: list[Any], solved: list[Any]) -> Sky:
         return self._sky.again(values, *([band[name] for band in solved] for name in ("shares", "known")))
@@ -113,7 +119,14 @@ class TableEvaluation(Evaluation):
         self._recorded = False
         self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
 
-    def _outputs(self, values: list[Any], views: dict[str, Any], pieces: None, solved: list[Any]) -> list[Any]:
+    def _outputs(
+        self,
+        values: list[Any],
+        views: dict[str, Any],
+        pieces: None,
+        solved: list[Any],
+        wanted: Collection[str] = OUTPUTS,
+    ) -> list[Any]:
         t, sky = types(), self._again(values, solved)
         altitude, sun_zenith = self._place
         ground = self._options["ground"]
@@ -123,9 +136,15 @@ class TableEvaluation(Evaluation):
         transmittance = [dr.gather(t.Float, evaluated(v), rows) for v in light.transmittance]
         sun, scattered = sky.irradiance(*(doubles([v]) for v in self._place))
         zero = dr.zeros(t.Float, dr.width(lane))
-        outputs = [v + zero for v in (*light.radiance, *transmittance, *sun, *scattered)]
-        dr.eval(outputs)
-        return outputs
+        return _wanted(wanted, light.radiance, transmittance, sun, scattered, zero)
+
+
+def _wanted(wanted: Collection[str], *parts: Any) -> list[Any]:
+    """The outputs wanted, evaluated together, all as wide as the last of the ``parts``."""
+    *groups, zero = parts
+    outputs = [v + zero for name, group in zip(OUTPUTS, groups, strict=True) if name in wanted for v in group]
+    dr.eval(outputs)
+    return outputs
 
 
 def where(views: dict[str, Any]) -> list[Any]:
