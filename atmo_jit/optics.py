@@ -223,8 +223,7 @@ class Optics:
         return table(self._phase_series(self.atmosphere, degree))
 
     def _phase_series(self, atmosphere: Atmosphere, degree: int) -> np.ndarray:
-        weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
-        return _legendre_values(degree) @ (weights[:, None] * self.scatterers_moments(degree, atmosphere))
+        return _phase_series(self._phases_of(atmosphere), degree)
 
     def phase_moments(self, degree: int) -> Any:
         """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
@@ -235,10 +234,13 @@ class Optics:
     def scatterers_moments(self, degree: int, atmosphere: Atmosphere | None = None) -> np.ndarray:
         """Legendre moments chi_l of the scatterers, or of those of an ``atmosphere`` like this: [l, scatterer x
         channel]."""
-        atmosphere = atmosphere or self.atmosphere
+        return _phase_moments(self._phases_of(atmosphere or self.atmosphere), degree)
+
+    def _phases_of(self, atmosphere: Atmosphere) -> tuple[Any, ...]:
+        """The scatterers' phase functions in every channel."""
         phases = [atmosphere.constituents[k].phase for k in self.scatterers]
-        columns = [moments_of(phase.at(int(i)), degree) for phase in phases for i in self.indices]
-        return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
+        alone = [phase.at(int(i)) for phase in phases for i in self.indices]
+        return tuple(_of_asymmetry(type(p), float(p.g)) if hasattr(p, "g") else p for p in alone)
 
     @property
     def profiles_differentiable(self) -> bool:
@@ -402,6 +404,27 @@ def _numbers_of(profile: Any) -> list[Any]:
     if isinstance(profile, Tabulated):
         return [profile.altitude_m, profile.values]
     return [getattr(profile, f.name) for f in fields(profile)]
+
+
+@lru_cache(maxsize=64)
+def _of_asymmetry(kind: type, g: float) -> Any:
+    """One phase function for all that are equal."""
+    return kind(g)
+
+
+# Kept: of the parameters by which derivatives are asked for few move a phase function.
+@lru_cache(maxsize=64)
+def _phase_moments(phases: tuple[Any, ...], degree: int) -> np.ndarray:
+    """Legendre moments of several phase functions, [l, phase function]."""
+    columns = [moments_of(phase, degree) for phase in phases]
+    return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
+
+
+@lru_cache(maxsize=64)
+def _phase_series(phases: tuple[Any, ...], degree: int) -> np.ndarray:
+    """Their Legendre series at the cosines of phase_node."""
+    weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
+    return _legendre_values(degree) @ (weights[:, None] * _phase_moments(phases, degree))
 
 
 def _distinct(phases: list[Any]) -> tuple[list[Any], list[int]]:
