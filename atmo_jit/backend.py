@@ -207,7 +207,7 @@ def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
     import drjit as dr
 
     t = types()
-    out = dr.zeros(t.Float, dr.width(lane) * size)
+    out = dr.empty(t.Float, dr.width(lane) * size)  # every lane writes its row
     padded_values = [*values, *[t.Float(0.0)] * (size - len(values))]
     dr.scatter(out, t.ArrayXf(padded_values) if size > 1 else padded_values[0], lane)
     return out
