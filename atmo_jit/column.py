@@ -58,11 +58,12 @@ class SunColumns:
         self._rule = integration_rule(optics)
         self.table = table if table is not None else self._build() if self._count else None
 
-    def of(self, optics: Optics) -> SunColumns:
-        """The table for other optics with profiles of the same kind, cut at the same altitudes."""
+    def of(self, optics: Optics, table: Any = None) -> SunColumns:
+        """The table for other optics with profiles of the same kind, cut at the same altitudes; ``table``: its
+        numbers, where they are known already."""
         other = copy(self)
         other.optics = optics
-        other.table = other._build() if self._count else None
+        other.table = table if table is not None else other._build() if self._count else None
         return other
 
     def _build(self) -> Any:
@@ -150,11 +151,12 @@ class SunColumns:
         return result
 
 
-def sun_columns(optics: Optics, grid: Grid) -> SunColumns:
-    """The table for an atmosphere, kept with the grid unless the profiles carry derivatives."""
+def sun_columns(optics: Optics, grid: Grid, table: Any = None) -> SunColumns:
+    """The table for an atmosphere, kept with the grid unless the profiles carry derivatives; ``table``: its numbers,
+    which carry those then."""
     with dr.suspend_grad():
         columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
-    return columns.of(optics) if optics.profiles_differentiable else columns
+    return columns.of(optics, table) if optics.profiles_differentiable else columns
 
 
 def integration_rule(optics: Optics) -> tuple[Any, Any]:

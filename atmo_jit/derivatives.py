@@ -272,8 +272,8 @@ class Linearization:
     @property
     def _solved(self) -> list[dict[str, Any]]:
         """What is taken over from the solve, per band."""
-        fields = [band.field for band in self.sky.solutions]
-        return [{"shares": field.shares, "known": field.known} for field in fields]
+        bands = self.sky.solutions
+        return [{"shares": b.field.shares, "columns": b.columns.table, "known": b.field.known} for b in bands]
 
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:

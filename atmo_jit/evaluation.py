@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ._trees import flat
+from ._trees import flat, like
 from .backend import doubles, evaluated, traversing, types
 from .parameters import VIEWS
 from .recording import Recordings, copied
@@ -32,7 +32,11 @@ class Evaluation:
 
     def __call__(self, *arguments: Any) -> list[Any]:
         """All outputs, one Float [N] each, in the order of OUTPUTS and wavelengths."""
-        return self._run("value", self._outputs, *arguments)
+
+        def function(values: Any, views: Any, pieces: Any, solved: Any) -> list[Any]:
+            return self._outputs(self._again(values, solved), views, pieces)
+
+        return self._run("value", function, *arguments)
 
     def forward(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
         """Outputs, and how they change along ``values`` and ``views``, the last two arguments (None: not at all)."""
@@ -42,46 +46,74 @@ class Evaluation:
     def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
         them the weights, W Floats [N] by output."""
-        *arrays, of_values, of_views = arguments
-        weighted = tuple(arrays[-1])
+        values, views, pieces, solved, weights, of_values, of_views = arguments
+        key = (tuple(weights), *of_values, *of_views)
+        by_columns = "profiles" in of_values and all(band["columns"] is not None for band in solved)
 
-        def function(values: Any, views: Any, pieces: Any, solved: Any, weights: Any) -> tuple[Any, Any]:
+        def leaves(values: Any, solved: Any) -> tuple[Any, Any]:
+            tables = [band["columns"] for band in solved]
+            return _named(values, of_values), [type(table)(table) for table in tables] if by_columns else tables
+
+        def of_field(values: Any, views: Any, pieces: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
+            """Derivatives by values, columns, views, and the light of the orders."""
             values, views = copied(values), copied(views)
-            wanted = [{name: part[name] for name in of_values} for part in values], {n: views[n] for n in of_views}
+            own, tables = leaves(values, solved)
+            orders = copied([band["orders"] for band in solved])
+            lights = [v for band in orders for v in (band["first"], *band["later"])] if of_values else []
+            wanted = own, tables if by_columns else [], {name: views[name] for name in of_views}, lights
             dr.enable_grad(wanted)
-            outputs = self._outputs(values, views, pieces, solved, weighted)
-            pairs = [(v, w) for v, w in zip(outputs, flat(weights), strict=True) if dr.grad_enabled(v)]
-            for output, weight in pairs:
-                dr.set_grad(output, weight)
-            dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
-            dr.traverse(dr.ADMode.Backward)
-            adjoints = dr.grad(wanted)
-            dr.eval(adjoints)
-            return adjoints
+            sky = self._sky.again(values, [band["shares"] for band in solved], tables, orders)
+            return _pulled_back(self._outputs(sky, views, pieces, tuple(weights)), flat(weights), wanted)
 
-        return self._run(("reverse", weighted, *of_values, *of_views), function, *arrays)
+        def of_orders(values: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
+            """Derivatives by values and columns, of the light of the orders."""
+            values = copied(values)
+            own, tables = leaves(values, solved)
+            wanted = own, tables if by_columns else []
+            dr.enable_grad(wanted)
+            orders = self._orders(values, solved, tables)
+            return _pulled_back([v for band in orders for v in (band["first"], *band["later"])], weights, wanted)
+
+        def of_columns(values: Any, weights: Any) -> Any:
+            """Derivatives by values, of the columns."""
+            values = copied(values)
+            wanted = _named(values, of_values)
+            dr.enable_grad(wanted)
+            return _pulled_back(self._sky.columns_again(values), weights, wanted)
+
+        # Several recordings: what one needs in between is free when it has been played.
+        small = [{**band, "known": None, "orders": _orders_of(band["known"])} for band in solved]
+        found, tables, by_views, lights = self._run(
+            ("reverse", *key), of_field, values, views, pieces, small, weights
+        )
+        if of_values:
+            more, again = self._run(("orders", *of_values), of_orders, values, solved, lights)
+            found = _sum(found, more)
+            if by_columns:
+                found = _sum(found, self._run(("columns", *of_values), of_columns, values, _sum(tables, again)))
+        return found, by_views
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():
             return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
 
     def _outputs(
-        self,
-        values: list[Any],
-        views: dict[str, Any],
-        pieces: list[Any],
-        solved: list[Any],
-        wanted: Collection[str] = OUTPUTS,
+        self, sky: Sky, views: dict[str, Any], pieces: list[Any], wanted: Collection[str] = OUTPUTS
     ) -> list[Any]:
-        sky = self._again(values, solved)
         place = where(views)
         light = sky.rays(*place, **self._options, pieces=pieces)
         horizontal = sky.irradiance(*place[:2]) if set(wanted) & set(OUTPUTS[2:]) else ([], [])
         zero = dr.zeros(types().Float, dr.width(place[0]))
         return _wanted(wanted, light.radiance, light.transmittance, *horizontal, zero)
 
+    def _orders(self, values: list[Any], solved: list[Any], columns: list[Any]) -> list[dict[str, Any]]:
+        shares, known = ([band[name] for band in solved] for name in ("shares", "known"))
+        return self._sky.orders_again(values, shares, columns, known)
+
     def _again(self, values: list[Any], solved: list[Any]) -> Sky:
-        return self._sky.again(values, *([band[name] for band in solved] for name in ("shares", "known")))
+        columns = self._sky.columns_again(values)
+        shares = [band["shares"] for band in solved]
+        return self._sky.again(values, shares, columns, self._orders(values, solved, columns))
 
     def _forward(
         self, values: Any, views: Any, pieces: Any, solved: Any, along_values: Any, along_views: Any
@@ -92,7 +124,7 @@ class Evaluation:
             pairs += [pair for name in steps for pair in zip(flat(made[name]), flat(steps[name]), strict=True)]
         for leaf, _ in pairs:
             dr.enable_grad(leaf)
-        outputs = self._outputs(values, views, pieces, solved)
+        outputs = self._outputs(self._again(values, solved), views, pieces)
         for leaf, step in pairs:
             dr.set_grad(leaf, step)
         dr.enqueue(dr.ADMode.Forward, *(leaf for leaf, _ in pairs))
@@ -120,14 +152,9 @@ class TableEvaluation(Evaluation):
         self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
 
     def _outputs(
-        self,
-        values: list[Any],
-        views: dict[str, Any],
-        pieces: None,
-        solved: list[Any],
-        wanted: Collection[str] = OUTPUTS,
+        self, sky: Sky, views: dict[str, Any], pieces: None, wanted: Collection[str] = OUTPUTS
     ) -> list[Any]:
-        t, sky = types(), self._again(values, solved)
+        t = types()
         altitude, sun_zenith = self._place
         ground = self._options["ground"]
         light = sky.table(altitude, self._view_zenith, sun_zenith, self._azimuth, ground=ground)
@@ -137,6 +164,30 @@ class TableEvaluation(Evaluation):
         sun, scattered = sky.irradiance(*(doubles([v]) for v in self._place))
         zero = dr.zeros(t.Float, dr.width(lane))
         return _wanted(wanted, light.radiance, transmittance, sun, scattered, zero)
+
+
+def _named(values: list[dict[str, Any]], names: Collection[str]) -> list[dict[str, Any]]:
+    return [{name: part[name] for name in names} for part in values]
+
+
+def _sum(tree: Any, other: Any) -> Any:
+    return like(tree, [a + b for a, b in zip(flat(tree), flat(other), strict=True)])
+
+
+def _orders_of(known: dict[str, Any]) -> dict[str, Any]:
+    return {name: known[name] for name in ("reference", "first", "later")}
+
+
+def _pulled_back(outputs: list[Any], weights: list[Any], wanted: Any) -> Any:
+    """Derivatives of the sum of weighted outputs by the leaves of ``wanted``, evaluated."""
+    pairs = [(v, w) for v, w in zip(outputs, weights, strict=True) if dr.grad_enabled(v)]
+    for output, weight in pairs:
+        dr.set_grad(output, weight)
+    dr.enqueue(dr.ADMode.Backward, *(output for output, _ in pairs))
+    dr.traverse(dr.ADMode.Backward)
+    adjoints = dr.grad(wanted)
+    dr.eval(adjoints)
+    return adjoints
 
 
 def _wanted(wanted: Collection[str], *parts: Any) -> list[Any]:

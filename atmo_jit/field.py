@@ -31,7 +31,7 @@ class Field:
     ``moments`` [K, suns, pairs(degree), channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
     channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above.
     ``scatters``: whether any of it scatters once more. ``shares``: what each order above the first counts in them;
-    ``known``: what multiple_scattering.solve_again need not compute once more, where that was asked for.
+    ``known``: what multiple_scattering.orders_again need not compute once more, where that was asked for.
     """
 
     shares: list[Any]

@@ -81,8 +81,18 @@ def solve(
     parts = steps.finish(values, done, later, shares)
     field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
     if noting:
-        field.known = {"reference": done["reference"], "tables": [table for some in tables for table in some]}
+        field.known = {"reference": done["reference"], "first": done["first"], "later": later}
+        field.known["tables"] = [table for some in tables for table in some]
     return field
+
+
+def orders_again(
+    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, count: int, known: dict[str, Any] | None
+) -> dict[str, Any]:
+    """The light of ``count`` orders, as solve_again takes it, for values of the optics that carry derivatives.
+    ``known``: what a solve for these very values found (Field.known). Nothing in here waits for a result."""
+    steps = _Steps(optics, columns, grid, resolution)
+    return steps.started(optics.values(resolution.degrees, resolution.phase_degree), count, known)
 
 
 def solve_again(
@@ -92,14 +102,13 @@ def solve_again(
     resolution: Resolution,
     shares: list[Any],
     orders: int | None,
-    known: dict[str, Any] | None = None,
+    done: dict[str, Any],
 ) -> Field:
-    """The same for values of the optics that carry derivatives, given the ``shares`` of a field that was solved, and
-    what is ``known`` from it if it was solved for these very values: nothing in here waits for a result."""
+    """The field for values of the optics that carry derivatives, given the ``shares`` of a field that was solved, and
+    the light of the orders: nothing in here waits for a result."""
     values = optics.values(resolution.degrees, resolution.phase_degree)
     optics = optics.with_values(values)
     steps = _Steps(optics, columns, grid, resolution)
-    done = steps.started(values, len(shares) + 1, known)
     parts = steps.finished(
         values, done["reference"], done["first"], done["later"], shares, extrapolated=orders is None
     )

@@ -27,7 +27,7 @@ from .errors import InputError
 from .field import Field
 from .grid import Grid
 from .march import Rays, Shells, march, rays_to_boundary
-from .multiple_scattering import solve, solve_again
+from .multiple_scattering import orders_again, solve, solve_again
 from .optics import MAX_CHANNELS, Optics
 from .parameters import check_names
 from .pieces import Pieces, light_along
@@ -123,18 +123,45 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns)
 
+    def columns_again(self, values: list[dict[str, Any]]) -> list[Any]:
+        """The tables of SunColumns for other ``values`` (Optics.values) of the bands."""
+        of_bands = zip(self._bands, values, strict=True)
+        return [sun_columns(band.optics.with_values(new), self.grid).table for band, new in of_bands]
+
+    def orders_again(
+        self,
+        values: list[dict[str, Any]],
+        shares: list[Any],
+        columns: list[Any],
+        known: list[dict[str, Any] | None] | None = None,
+    ) -> list[dict[str, Any]]:
+        """The light of the orders for other ``values``, which may carry derivatives, as many as there are ``shares``;
+        ``columns``: see columns_again; ``known`` (Field): from a solve for these values."""
+        done = []
+        for i, (band, new) in enumerate(zip(self._bands, values, strict=True)):
+            optics, grid = band.optics.with_values(new), self.grid
+            toward_sun = sun_columns(optics, grid, columns[i])
+            of_solve = known and known[i]
+            done.append(orders_again(optics, toward_sun, grid, self.resolution, len(shares[i]) + 1, of_solve))
+        return done
+
     def again(
-        self, values: list[dict[str, Any]], shares: list[Any], known: list[dict[str, Any] | None] | None = None
+        self,
+        values: list[dict[str, Any]],
+        shares: list[Any],
+        columns: list[Any] | None = None,
+        orders: list[dict[str, Any]] | None = None,
     ) -> Sky:
         """The sky for other ``values`` (Optics.values) of its bands, which may carry derivatives, with the ``shares``
-        of orders (Field) of a sky that was solved, on the same nodes; ``known`` (Field): from a solve for the same
-        values."""
+        of orders (Field) of a sky that was solved, on the same nodes; ``columns``, ``orders``: see columns_again and
+        orders_again."""
         other, other._bands = copy(self), []
-        of_bands = zip(self._bands, values, shares, known or [None] * len(shares), strict=True)
-        for band, new, of_orders, of_solve in of_bands:
+        tables = columns or self.columns_again(values)
+        orders = orders or self.orders_again(values, shares, tables)
+        for band, new, table, of_orders, done in zip(self._bands, values, tables, shares, orders, strict=True):
             optics = band.optics.with_values(new)
-            columns = sun_columns(optics, self.grid)
-            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders, of_solve)
+            columns = sun_columns(optics, self.grid, table)
+            field = solve_again(optics, columns, self.grid, self.resolution, of_orders, self.orders, done)
             other._bands.append(_Band(field.optics, columns, field))
         return other
 
