@@ -18,6 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from . import noted
 from .backend import evaluated, floats, packet, row, row_size, stored, table, table_of, types, uints
 from .geometry import safe_sine
 from .grid import Grid, cubic
@@ -58,13 +59,12 @@ class Samples:
         nu = dr.fma(mu0, mu_s, safe_sine(mu0) * sin_s * cos_phi)
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
         self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
-        self._shape = len(paths.station), suns * azimuths
-        self._suns = suns
+        self.suns, self.per_visit = suns, suns * azimuths
 
     @cached_property
     def readers(self) -> Readers:
         """Who reads each sun of a table of all visits."""
-        return Readers(self.place.numpy().reshape(*self._shape, 2)[..., 0], self._suns)
+        return Readers(self.place.numpy().reshape(-1, self.per_visit, 2)[..., 0], self.suns)
 
 
 class Gather:
@@ -110,34 +110,7 @@ class Gather:
             self.optics, self.paths, self.held["scattered"], self.held["reflected"], light.degree, orders
         )
         table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
-        per_visit = suns * self.azimuths
-
-        def transposed(grad: Any, _: int, __: Any) -> Any:
-            of_samples = self.samples.place, self.held["scale"]
-            return by_table(self.samples.readers, self.paths, *of_samples, grad, per_visit, suns, orders, channels)
-
-        radiance = multilinear(lambda table: self._radiance(table, orders, channels), transposed, table)
-        return self._harmonics(radiance)
-
-    def _radiance(self, table: Any, orders: int, channels: int) -> Any:
-        """Radiance at the nodes, [rays, S, azimuths, 4], from the table of ``contracted``."""
-        t, suns, device = types(), self.grid.shape[1], self.paths.device
-        per_visit = suns * self.azimuths
-        lane = dr.arange(t.UInt, len(self.paths.h) * per_visit)
-        ray, sample = lane // per_visit, lane % per_visit
-        start, stop = dr.gather(t.UInt, device.first_visit, ray), dr.gather(t.UInt, device.first_visit, ray + 1)
-
-        def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-            place = i * per_visit + sample
-            x, cos_phi = packet(self.samples.place, place, 2)
-            scale = packet(self.held["scale"], place, 4)
-            # The table has one more sun before the first and after the last.
-            inner = seen(table, i * (suns + 2), x, suns, cos_phi, orders, channels)
-            return i + 1, [dr.fma(scale[c], inner[c], sums[c]) for c in range(channels)]
-
-        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
-        _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, max_iterations=-1, label="gather")
-        return stored(sums, lane, 4)
+        return self._harmonics(interpolated(self.samples, self.held["scale"], table, orders, channels))
 
     def _harmonics(self, radiance: Any) -> Any:
         t, channels, suns, azimuths = types(), self.optics.channel_count, self.grid.shape[1], self.azimuths
@@ -206,6 +179,34 @@ class Gather:
         return evaluated(values)
 
 
+def interpolated(samples: Samples, scale: Any, table: Any, orders: int, channels: int) -> Any:
+    """Radiance at the nodes, [rays, S, azimuths, 4]: sum over visits of ``scale`` [visits, S, azimuths, 4] times the
+    ``table`` [visits, S + 2, m x channels] at the samples."""
+    t, paths, suns, per_visit = types(), samples.paths, samples.suns, samples.per_visit
+
+    def transposed(grad: Any, _: int, __: Any) -> Any:
+        return by_table(samples.readers, paths, samples.place, scale, grad, per_visit, suns, orders, channels)
+
+    def radiance(table: Any) -> Any:
+        lane = dr.arange(t.UInt, len(paths.h) * per_visit)
+        ray, sample = lane // per_visit, lane % per_visit
+        start, stop = (dr.gather(t.UInt, paths.device.first_visit, ray + i) for i in (0, 1))
+
+        def visit(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+            place = i * per_visit + sample
+            x, cos_phi = packet(samples.place, place, 2)
+            factor = packet(scale, place, 4)
+            # The table has one more sun before the first and after the last.
+            inner = seen(table, i * (suns + 2), x, suns, cos_phi, orders, channels)
+            return i + 1, [dr.fma(factor[c], inner[c], sums[c]) for c in range(channels)]
+
+        zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
+        _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, max_iterations=-1, label="gather")
+        return stored(sums, lane, 4)
+
+    return multilinear(radiance, transposed, table)
+
+
 def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:
     """Sum over m of cos(m phi) times a table [suns + 2, m x channels], from row ``first`` on, cubic at the sun
     coordinate ``x``."""
@@ -237,7 +238,8 @@ def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int,
         nodes = dr.width(moments) // (suns * rows * row_size(width))
         return by_moments(paths, grad, weights, nodes, suns, rows, width)
 
-    return multilinear(lambda *both: _contracted(paths, *both, suns, rows, width), transposed, moments, weights)
+    with noted.passing():
+        return multilinear(lambda *both: _contracted(paths, *both, suns, rows, width), transposed, moments, weights)
 
 
 def _contracted(paths: Paths, moments: Any, weights: Any, suns: int, rows: int, width: int) -> Any:

@@ -3,6 +3,7 @@ again on the way to them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -47,6 +48,18 @@ def note(tables: list[Any]) -> None:
     """Add evaluated tables to the notes, where they are taken."""
     if _notes is not None:
         _notes.extend(tables)
+
+
+@contextmanager
+def passing() -> Iterator[None]:
+    """What is evaluated in this block is read by nothing but what is noted after it, and linearly: its numbers are not
+    needed again, nor kept."""
+    import drjit as dr
+
+    before = len(_notes or ())
+    yield
+    if _notes is not None:
+        _notes[before:] = [dr.full(type(table), math.nan, dr.width(table)) for table in _notes[before:]]
 
 
 def take(count: int) -> list[Any] | None:
