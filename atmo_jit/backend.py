@@ -150,7 +150,11 @@ def row(
     packet."""
     size = row_size(length or count)
     step = min(size, 8)
-    parts = [packet(buffer, index * (size // step) + i, step, active, alone=alone) for i in range(-(-count // step))]
+    parts = [packet(buffer, index * (size // step) + i, step, active, alone=alone) for i in range(count // step)]
+    done = count - count % step
+    if done < count:
+        last = row_size(count - done)
+        parts.append(packet(buffer, index * (size // last) + done // last, last, active, alone=alone))
     return [value for part in parts for value in part][:count]
 
 
