@@ -12,6 +12,10 @@ from typing import Any
 
 import drjit as dr
 
+# The largest cosine below 1 in single precision, 3.5e-4 radians from the vertical. Nearer directions count as so far
+# from it: sin * cos(azimuth), which light is linear in there, follows from other angles, and at 1 it would be lost.
+UPRIGHT = 1.0 - 2.0**-24
+
 
 def altitude_along(radius: Any, h: Any, mu: Any, distance: Any) -> tuple[Any, Any]:
     """Altitude and radius (m) of the point ``distance`` along the ray (h, mu): h' = h + d (2 r mu + d) / (r + r').

@@ -18,7 +18,7 @@ import numpy as np
 
 from .backend import floats, packet, parameter, row, table_of, types
 from .column import SunColumns
-from .geometry import altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
+from .geometry import UPRIGHT, altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
 from .optics import Optics
 from .quadrature import gauss_legendre, running_integral
 
@@ -91,7 +91,7 @@ def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
 def point_along(optics: Optics, rays: Rays, distance: Any) -> tuple[Any, Any, Any]:
     """Altitude, radius and sun cosine of the point at ``distance`` along each ray."""
     h, r = altitude_along(optics.radius, rays.h, rays.mu, distance)
-    mu_s = dr.clip(dr.fma(distance, rays.nu, (optics.radius + rays.h) * rays.mu_s) / r, -1.0, 1.0)
+    mu_s = dr.clip(dr.fma(distance, rays.nu, (optics.radius + rays.h) * rays.mu_s) / r, -UPRIGHT, UPRIGHT)
     return h, r, mu_s
 
 
@@ -301,7 +301,7 @@ def march(
         if source is not None:
             at = dr.fma(length, dr.select(total > 0.0, centroid / total, 0.5), d)
             h, r, mu_s = point_along(optics, rays, at)
-            mu = dr.clip((r_mu + at) / r, -1.0, 1.0)
+            mu = dr.clip((r_mu + at) / r, -UPRIGHT, UPRIGHT)
             toward = source.scattered(h, mu_s, mu, relative_azimuth(mu, mu_s, rays.nu), total > 0.0)
             for n in range(len(optics.scatterers)):
                 for c in range(c_count):

@@ -15,7 +15,7 @@ import drjit as dr
 from .backend import evaluated, row, sum_loop, table_of, types
 from .column import SunColumns
 from .field import Field
-from .geometry import altitude_along
+from .geometry import UPRIGHT, altitude_along
 from .march import (
     NODES,
     Cuts,
@@ -195,7 +195,7 @@ def _asked(optics: Optics, source: Field, rays: Rays, at: Any, length: Any, acti
 
     def toward(distance: Any) -> list[Any]:
         altitude, r, sun = point_along(optics, rays, distance)
-        mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -1.0, 1.0)
+        mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -UPRIGHT, UPRIGHT)
         values = source.unclipped(altitude, sun, mu, relative_azimuth(mu, sun, rays.nu), active)
         return [value for of_kind in values for value in of_kind]
 

@@ -15,6 +15,7 @@ from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
 MOST_ALTITUDES = 48
+MANY = 20  # events; light that has as many is lost by what each order lacks
 # Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
@@ -98,7 +99,7 @@ class Resolution:
             stages = [replace(stages[0], degree=first, up=up, down=up - 2)]
             altitudes += FINE_ALTITUDES
         return cls(
-            altitudes=_altitudes(atmosphere, altitudes, 16.0 if thick else 8.0),
+            altitudes=_altitudes(atmosphere, altitudes, thick),
             suns=(21, 25, 29, 33)[level],
             first_suns=(1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
@@ -158,11 +159,14 @@ def moments_of(phase: Any, degree: int) -> np.ndarray:
 _moments: dict[Any, np.ndarray] = {}
 
 
-def _altitudes(atmosphere: Atmosphere, clear: int, per_doubling: float) -> int:
-    """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared."""
+def _altitudes(atmosphere: Atmosphere, clear: int, thick: bool) -> int:
+    """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared; up to
+    twice as many more in ``thick`` air, where what each order lacks adds up unless light is absorbed first."""
     depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
-    scattering = sum(depths, start=np.zeros(1))
-    extra = per_doubling * np.log2(1.0 + max(float(np.max(scattering)) - 0.3, 0.0) / 2.0)
+    scattering, depth = sum(depths, start=np.zeros(1)), _depth(atmosphere)
+    albedo = np.divide(scattering, depth, out=np.zeros(depth.shape), where=depth > 0.0)
+    per_doubling = 8.0 * (1.0 + thick * albedo**MANY)
+    extra = float(np.max(per_doubling * np.log2(1.0 + np.maximum(scattering - 0.3, 0.0) / 2.0)))
     return min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from atmo_jit.geometry import UPRIGHT
 from atmo_jit.march import Rays, point_along, rays_to_boundary, relative_azimuth, visible_sun
 from atmo_jit.phase import HenyeyGreenstein
 
@@ -246,7 +247,7 @@ class _Walk:
         """What the air scatters there of scattered light (W/m), 0 where not ``active``."""
         o = band.optics
         h, r, mu_s = point_along(o, line, distance)
-        mu = dr.clip(dr.fma(o.radius + line.h, line.mu, distance) / r, -1.0, 1.0)
+        mu = dr.clip(dr.fma(o.radius + line.h, line.mu, distance) / r, -UPRIGHT, UPRIGHT)
         found = source.scattered(h, mu_s, mu, relative_azimuth(mu, mu_s, line.nu), active)
         light = _scattering(o, o.densities(h), dict(zip(o.scatterers, found, strict=True)))
         return [dr.select(active, value, 0.0) for value in light]

@@ -34,6 +34,12 @@ def test_fog_needs_more_altitudes_and_accuracy_costs():
     assert suited(tolerance=0.001).first_degree > suited().first_degree
 
 
+def test_thick_air_that_absorbs_needs_fewer_altitudes_than_white_clouds():
+    clouds = [{"mie.scattering_per_m": 5e-3, "mie.single_scattering_albedo": albedo} for albedo in (1.0, 0.99, 0.9)]
+    altitudes = [suited(cloud).altitudes for cloud in clouds]
+    assert altitudes == sorted(altitudes, reverse=True) and altitudes[0] >= altitudes[-1] + 8
+
+
 def test_fine_solves_have_all_degrees_in_all_orders():
     for changes in ({}, {"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.85}):
         air = EARTH.replace(changes)
