@@ -29,6 +29,7 @@ from .march import (
 )
 from .optics import Optics
 
+LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves a level too slowly to tell where
 FARTHER = 0.05  # of a piece: a step over which light changes by far more than its rounding
 # Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
 # line, leaves single precision.
@@ -130,6 +131,10 @@ def light_along(
     h, mu, mu_s, nu, stop = (dr.gather(t.Float, v, pieces.ray) for v in members)
     here, start = Rays(h, mu, mu_s, nu, stop, pieces.closes), pieces.start
     length = dr.select(pieces.closes, stop - start, pieces.length)
+    if dr.grad_enabled(h, mu):
+        first, last = (_at_its_level(optics, here, distance) for distance in (start, start + length))
+        length = dr.select(pieces.closes, length - first, length + last - first)
+        start = start + first
     density = [
         optics.densities(altitude_along(optics.radius, h, mu, dr.fma(length, x, start))[0]) for x in rule.few_x
     ]
@@ -211,6 +216,20 @@ def _asked(optics: Optics, source: Field, rays: Rays, at: Any, length: Any, acti
     values, slopes = held[: len(values)], held[len(values) :]
     by = at - dr.detach(at)
     return [dr.fma(by, slope, value) for value, slope in zip(values, slopes, strict=True)]
+
+
+def _at_its_level(optics: Optics, rays: Rays, distance: Any) -> Any:
+    """0, with the derivative of a ``distance`` at which a ray has one altitude, whatever its direction.
+
+    The source is asked once for every piece, and exact where it is linear over it: what that leaves out changes little
+    from ray to ray as long as rays are cut at the same altitudes.
+    """
+    h, mu = dr.detach(rays.h), dr.detach(rays.mu)
+    r = optics.radius + h
+    rises = dr.fma(r, mu, distance)  # r there, times the cosine of the zenith angle
+    steep = (dr.abs(rises) > LEVEL * r) & (distance > 0.0)
+    moves = r * distance * (rays.mu - mu) + dr.fma(mu, distance, r) * (rays.h - h)
+    return dr.select(steep, -moves / dr.select(steep, rises, 1.0), 0.0)
 
 
 def _room(count: int) -> int:
