@@ -129,6 +129,18 @@ def atomic_outputs(*paths: Path) -> Iterator[tuple[Path, ...]]:
                     part.unlink(missing_ok=True)
 
 
+def write_npz(path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> None:
+    """Arrays as an NPZ file, over what is there.
+
+    `numpy.savez` does the same, but some versions leave the archive open where the disk is full; it then complains when
+    Python clears it away.
+    """
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                npy.write_array(stream, np.asarray(array), allow_pickle=False)
+
+
 def read_npz(path: str | os.PathLike[str], *, kinds: str = KINDS, limit: int = NPZ_LIMIT) -> dict[str, np.ndarray]:
     """The arrays of an NPZ file, by name, in native byte order.
 

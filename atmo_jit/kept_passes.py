@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import InputError
-from .files import check_output, read_npz
+from .files import check_output, read_npz, write_npz
 from .partial import check_same, not_ours, partial_path
 from .passes import Passes
 
@@ -50,8 +50,7 @@ class KeptPasses:
     def write(self, part: Path, passes: Passes, seconds: float) -> None:
         """The passes done and the seconds that they took, to a temporary file."""
         about = json.dumps({"settings": self.settings, "seconds": seconds})
-        with open(part, "wb") as file:
-            np.savez(file, **passes.state(), meta=np.array(about))
+        write_npz(part, passes.state() | {"meta": np.array(about)})
 
     def _read(self, pixels: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         try:

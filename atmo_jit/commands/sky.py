@@ -10,7 +10,7 @@ import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import InputError
-from atmo_jit.files import atomic_outputs, check_output
+from atmo_jit.files import atomic_outputs, check_output, write_npz
 from atmo_jit.progress import progress_bar
 from atmo_jit.views import load_views
 
@@ -82,8 +82,8 @@ def command(
         for name in ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
     }
     arrays |= result.gradient
-    with atomic_outputs(path) as (part,), open(part, "wb") as file:
-        np.savez(file, **arrays, meta=np.array(json.dumps(result.meta)))
+    with atomic_outputs(path) as (part,):
+        write_npz(part, arrays | {"meta": np.array(json.dumps(result.meta))})
     if not quiet:
         count, bands = arrays["radiance"].shape
         click.echo(f"{out}: {count} views, {bands} wavelengths, {result.meta['seconds']:.2f} s")

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..backend import floats, types
 from ..errors import InputError
-from ..files import atomic_outputs
+from ..files import atomic_outputs, write_npz
 from ..image import write_planes
 
 CHANNELS = ("R", "G", "B", "A")
@@ -147,8 +147,7 @@ def npz(name: str, arrays: dict[str, np.ndarray]) -> File:
     """Several NumPy arrays."""
 
     def write(path: Path) -> None:
-        with open(path, "wb") as file:
-            np.savez(file, **arrays)
+        write_npz(path, arrays)
 
     def read(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as held:
