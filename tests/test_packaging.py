@@ -32,6 +32,17 @@ def test_every_package_is_installed_and_nothing_else():
     assert all(name.partition(".")[0] == "atmo_jit" for name in PROJECT["tool"]["setuptools"]["packages"])
 
 
+def test_the_oldest_versions_are_those_of_the_project():
+    text = (ROOT / ".ci" / "oldest.txt").read_text(encoding="utf-8")
+    pinned = dict(re.findall(r"^([\w-]+)==([\d.]+)$", text, re.M))
+    project = PROJECT["project"]
+    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
+    bounds = dict(re.match(r"([\w-]+)>=([\d.]+)", requirement).groups() for requirement in wanted)
+    assert pinned.keys() - bounds.keys() == {"jaxlib"} and bounds.keys() <= pinned.keys()
+    for name, bound in bounds.items():
+        assert pinned[name] == bound or pinned[name].startswith(f"{bound}."), name
+
+
 def test_every_data_file_is_installed():
     settings = PROJECT["tool"]["setuptools"]
     for package in settings["packages"]:
