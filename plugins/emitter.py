@@ -104,8 +104,10 @@ Sun and sky of a planet's atmosphere (:monosp:`atmosphere`)
  * - refraction
    - |bool|
    - Show the sun, and light the air, where the atmosphere's own refraction lifts the sun: half a degree at the
-     horizon. ``sun_direction`` or location and time then mean the true place. Rays of view stay straight: the disc is
-     not flattened and the horizon not raised (Default: false).
+     horizon. ``sun_direction`` or location and time then mean the true place. The disc is flattened to an ellipse,
+     of 0.81 of its width where it rests on the horizon of ``earth``. Its radiance stays, so its irradiance is less by
+     as much; light in the air and on the planet's ground is not. Rays of view stay straight: the horizon is not
+     raised. Where the air is path-traced (``--reference``) the sun is lifted, but round (Default: false).
 
  * - albedo
    - |spectrum|
@@ -251,15 +253,17 @@ use the bounds of all shapes that are loaded; in scalar variants call ``emitter.
         settings.turning(host(self._to_world.matrix))
         self._update_atmosphere()
         sun = self._local_sun()
+        squeeze = 1.0
         if self._refraction:
             altitude = first(self._values["altitude"])
             sun = mi.Vector3f(*settings.as_seen(self._atmosphere, altitude, sun, host(sun)))
+            squeeze = settings.squeeze(self._atmosphere, altitude, host(sun))
         if dr.is_jit_v(mi.Float):
             dr.make_opaque(sun, self._sun_direction)
         if self._sky is None:
             self._sky = _solved(self._atmosphere)
         follows = self._exposed.followed()
-        light = Light(self._sky, self._values["altitude"], sun, self._limb_darkening, parameters=follows)
+        light = Light(self._sky, self._values["altitude"], sun, self._limb_darkening, squeeze, follows)
         if self._light is not None:
             # The tensors that mi.traverse has handed out stay those that are in use.
             for name in ("sky_table", "sun_table"):

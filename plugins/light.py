@@ -45,6 +45,8 @@ class Where:
 class Light:
     """The light of an atmosphere for an observer at ``altitude`` (m) and a sun in the local direction ``sun``.
 
+    ``squeeze``: vertical over horizontal diameter of the sun's disc.
+
     ``parameters``: those by which the tables are differentiable, arrays by name (atmo_jit.parameters.parameter_names).
     ``sky_table`` and ``sun_table`` are the tensors that look-ups read; whoever changes them calls :meth:`prepare`.
     """
@@ -55,6 +57,7 @@ class Light:
         altitude: Any,
         sun: Any,
         limb_darkening: bool,
+        squeeze: float = 1.0,
         parameters: dict[str, Any] | None = None,
     ) -> None:
         self.basis = SpectralBasis.of(sky.atmosphere)
@@ -75,7 +78,7 @@ class Light:
 
         aperture = max(2.0 * air.sun_angular_radius_deg, settings.SMALLEST_SUN_DEG)
         follows = dict(parameters or {}) | ({"altitude_m": altitude} if dr.grad_enabled(altitude) else {})
-        self.disc = solve_disc(sky, self.view, math.radians(0.5 * aperture), limb_darkening)
+        self.disc = solve_disc(sky, self.view, math.radians(0.5 * aperture), limb_darkening, squeeze)
         self.sun_table = self.channels.tensor(disc_radiance(sky, self.disc, self.view, follows), SUN_SHAPE)
 
     def _follow(self, sky: Sky, value: Any, before: dict[str, float], after: dict[str, float]) -> None:
@@ -111,7 +114,7 @@ class Light:
                 raise InputError(f"{name}: found a tensor of shape {tuple(table.shape)}; allowed: {shape} x channels")
         self._sky_texture, self._sun_texture = texture(self.sky_table), texture(self.sun_table)
         self._sky = SkyLookup(self.view, self.channels.node_luminance(self.sky_table))
-        self._sun = SunLookup(self.disc)
+        self._sun = SunLookup(self.disc, host(self.sun))
         luminance = max(float(self.basis.xyz_matrix[1] @ (self.disc.mean * self.basis.solar_irradiance)), 0.0)
         share = sun_share(luminance * sun_scale, self._sky.flux * sky_scale, math.cos(self.view.sun_zenith))
         self._share, self._rest = number(share), number(1.0 - share)
@@ -144,6 +147,11 @@ class Light:
     def sun_density(self) -> Any:
         """Density per solid angle (1/sr) of directions drawn from the sun's disc."""
         return self._sun.density
+
+    @property
+    def sun_squeeze(self) -> Any:
+        """Vertical over horizontal diameter of the disc: what is left of its irradiance, as its radiance stays."""
+        return self._sun.squeeze
 
     def sun_pdf(self, d: Any) -> Any:
         """That density in a direction: 0 beside the disc."""

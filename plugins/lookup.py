@@ -175,18 +175,37 @@ def importance(view: Panorama, luminance: np.ndarray) -> tuple[np.ndarray, float
 
 
 class SunLookup:
-    """The disc in the variant's types: is a direction inside, where in the table, and even sampling of it."""
+    """The disc in the variant's types: is a direction inside, where in the table, and even sampling of it.
 
-    def __init__(self, disc: Disc) -> None:
+    ``sun``: direction of its centre, a plain array. A squeezed disc is an ellipse in Lambert's equal-area projection
+    about its centre, in which distances from there are chords: sampling it evenly is exact for discs of any size.
+    """
+
+    def __init__(self, disc: Disc, sun: np.ndarray) -> None:
         self.low = number(disc.low)
         self.scale = number(1.0 / max(disc.high - disc.low, 1e-9))
         self.half_chord = number(math.sin(0.5 * disc.radius))
         self.inverse_chord2 = number(1.0 / (2.0 * math.sin(0.5 * disc.radius)) ** 2)
-        self.density = number(1.0 / disc.solid_angle)
+        self.density = number(1.0 / (disc.squeeze * disc.solid_angle))
+        self.squeezed = disc.squeeze != 1.0
+        self.squeeze = number(disc.squeeze) if self.squeezed else 1.0
+        if self.squeezed:
+            x, y, z = (float(v) for v in sun)
+            across = math.hypot(x, y)
+            hx, hy = (x / across, y / across) if across > 0.0 else (1.0, 0.0)
+            self.right = tuple(number(v) for v in (-hy, hx, 0.0))
+            self.up = tuple(number(v) for v in (-hx * z, -hy * z, across))
+            self.stretch = number(1.0 / disc.squeeze**2 - 1.0)
 
     def distance2(self, d: Any, sun: Any) -> Any:
         """Squared distance of ``d`` from the centre, 1 at the limb: by the chord, as single precision loses 1 - cos."""
-        return dr.squared_norm(d - sun) * self.inverse_chord2
+        offset = d - sun
+        chord2 = dr.squared_norm(offset)
+        if self.squeezed:
+            height = dr.dot(offset, mi.Vector3f(*self.up))
+            projected2 = height * height / dr.maximum(dr.fma(chord2, -0.25, 1.0), 1e-6)  # 0 / 0 opposite the sun
+            chord2 = dr.fma(self.stretch, projected2, chord2)
+        return chord2 * self.inverse_chord2
 
     def node(self, a: Any, distance2: Any) -> tuple[Any, Any]:
         """Texture coordinates (distance, elevation) between the first and the last texel's centre."""
@@ -195,6 +214,14 @@ class SunLookup:
 
     def sample(self, sample: Any, sun: Any) -> Any:
         """A direction within the disc, even in solid angle."""
+        if self.squeezed:
+            sin_phi, cos_phi = dr.sincos(2.0 * dr.pi * sample.y)
+            s = self.half_chord * dr.sqrt(sample.x)
+            x, y = s * cos_phi, s * sin_phi * self.squeeze
+            s2 = dr.fma(x, x, y * y)
+            stretch = 2.0 * dr.sqrt(1.0 - s2)
+            frame = mi.Frame3f(mi.Vector3f(*self.right), mi.Vector3f(*self.up), sun)
+            return frame.to_world(mi.Vector3f(stretch * x, stretch * y, dr.fma(-2.0, s2, 1.0)))
         s = self.half_chord * dr.sqrt(sample.x)  # sine of half the angle from the centre
         sine = 2.0 * s * dr.sqrt(dr.fma(-s, s, 1.0))
         sin_phi, cos_phi = dr.sincos(2.0 * dr.pi * sample.y)

@@ -180,12 +180,12 @@ def solve_sky(sky: Any, view: Panorama, nodes: Panorama | None = None, parameter
 @dataclass(frozen=True)
 class Disc:
     """The sun's disc: seen between ``low`` and ``high`` (rad above the horizon), its brightness there relative to an
-    unattenuated, even one.
+    unattenuated, even one of angular ``radius`` (rad). ``squeeze``: its vertical over its horizontal diameter.
 
     ``low`` >= ``high``: it has set. ``brightness`` [SUN_ROWS, SUN_COLUMNS, W]: along elevation from ``low`` to
     ``high``, and along the square of the distance from the centre (0 centre, 1 limb); without limb darkening all
-    columns are equal. ``mean`` [W]: the mean over the whole disc, which is the fraction of the sun's irradiance that
-    arrives.
+    columns are equal. ``mean`` [W]: the mean over the whole disc times ``squeeze``, which is the fraction of
+    the sun's irradiance that arrives.
     """
 
     radius: float
@@ -193,10 +193,11 @@ class Disc:
     high: float
     brightness: np.ndarray
     mean: np.ndarray
+    squeeze: float = 1.0
 
     @property
     def solid_angle(self) -> float:
-        """Of the whole disc, also where it has set (sr)."""
+        """Of the whole disc before it is squeezed, also where it has set (sr)."""
         return 4.0 * math.pi * math.sin(0.5 * self.radius) ** 2
 
 
@@ -242,18 +243,23 @@ def disc_radiance(sky: Any, disc: Disc, view: Panorama, parameters: Any = None) 
     return values
 
 
-def solve_disc(sky: Any, view: Panorama, radius: float, limb_darkening: bool = False) -> Disc:
+def solve_disc(
+    sky: Any, view: Panorama, radius: float, limb_darkening: bool = False, squeeze: float = 1.0
+) -> Disc:
     """Transmittance towards the visible part of a disc of angular ``radius`` (rad); dark below the horizon.
+
+    ``squeeze``: see :class:`Disc`. Radiance stays, so that irradiance shrinks with the solid angle.
 
     Limb darkening after Hestroffer and Magnan, A&A 333 (1998): brightness mu^alpha, alpha = -0.023 + 0.292 / lambda
     (micrometres), scaled so that the disc's irradiance does not change.
     """
     wavelengths = np.asarray(sky.atmosphere.wavelengths_nm)
-    low = max(view.sun_height - radius, EDGE_RAD)
-    high = min(view.sun_height + radius, view.horizon_zenith)
+    half_height = radius * squeeze
+    low = max(view.sun_height - half_height, EDGE_RAD)
+    high = min(view.sun_height + half_height, view.horizon_zenith)
     if high <= low:
         shape = (SUN_ROWS, SUN_COLUMNS, len(wavelengths))
-        return Disc(radius, 1.0, 0.0, np.zeros(shape), np.zeros(len(wavelengths)))
+        return Disc(radius, 1.0, 0.0, np.zeros(shape), np.zeros(len(wavelengths)), squeeze)
     a = np.linspace(low, high, SUN_ROWS)
     light = sky.rays(*_together(view.altitude_m, view.sun_zenith, view.horizon_zenith - a, 0.0))
     dr.eval(light.transmittance)
@@ -266,11 +272,11 @@ def solve_disc(sky: Any, view: Panorama, radius: float, limb_darkening: bool = F
         shape /= 0.5 * (shape[1:] + shape[:-1]).mean(axis=0)
     # Mean over the disc: chords at equal steps of elevation, the part below the horizon counting as dark.
     edges = np.linspace(low, high, 2 * SUN_ROWS + 1)
-    part = _below((edges - view.sun_height) / radius)
+    part = _below((edges - view.sun_height) / half_height)
     middle = 0.5 * (edges[1:] + edges[:-1])
     inside = np.stack([np.interp(middle, a, t) for t in transmittance.T], axis=-1)
-    mean = (inside * np.diff(part)[:, None]).sum(axis=0)
-    return Disc(radius, low, high, transmittance[:, None, :] * shape[None, :, :], mean)
+    mean = squeeze * (inside * np.diff(part)[:, None]).sum(axis=0)
+    return Disc(radius, low, high, transmittance[:, None, :] * shape[None, :, :], mean, squeeze)
 
 
 def _together(*values: Any) -> list[Any]:

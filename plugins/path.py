@@ -253,7 +253,7 @@ class AtmospherePath:
             inscatter, surfaces = self._inscatter(scene, sampler, ray, part, light, air, colours, passed, active)
             lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
             disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
-            disc = dr.select(active & ~surface & ~grounded, disc, 0.0)
+            disc = dr.select(active & ~surface & ~grounded, disc * light.sun_squeeze, 0.0)
             ground = air.on_ground(ray(part.distance), lit)
             arriving = light.sum(passed, inscatter, part.transmittance, ground, grounded, disc)
             arriving = colours.of(arriving, ray.wavelengths) + surfaces * light.sky_scale
@@ -285,7 +285,7 @@ class AtmospherePath:
             wo = si.to_local(toward)
             value, pdf = bsdf.eval_pdf(context, si, wo, facing)
             mixed = light.mixed_pdf(pdf, toward)
-            weight = mis_weight(light.sun_density, mixed) * light.sun_scale
+            weight = mis_weight(light.sun_density, mixed) * light.sun_scale * light.sun_squeeze
             sunlight = colours.of(products(air.sunlight(si.p, toward), passed), ray.wavelengths)
             gain = reflected * unpolarized(value) * sunlight * weight
             result += dr.select(facing, gain, 0.0)

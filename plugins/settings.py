@@ -18,7 +18,7 @@ import numpy as np
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.errors import AtmosphereError, InputError, shown
 from atmo_jit.files import is_file
-from atmo_jit.refraction import lift
+from atmo_jit.refraction import flattening, lift
 from atmo_jit.wavelengths import at_wavelengths, chosen
 
 from .sun_position import Moment, sun_direction
@@ -102,6 +102,15 @@ def as_seen(atmosphere: Atmosphere, altitude_m: float, local: Any, plain: np.nda
     sin, cos = float(np.sin(angle)), float(np.cos(angle))
     horizontal = cos - z / across * sin
     return [x * horizontal, y * horizontal, z * cos + across * sin]
+
+
+def squeeze(atmosphere: Atmosphere, altitude_m: float, seen: np.ndarray) -> float:
+    """Vertical over horizontal diameter of the sun's disc where refraction shows it in the local direction ``seen``:
+    1 for observers above the air."""
+    if altitude_m >= atmosphere.thickness_m:
+        return 1.0
+    radius = np.radians(max(atmosphere.sun_angular_radius_deg, 0.5 * SMALLEST_SUN_DEG))
+    return float(flattening(atmosphere, np.arctan2(np.hypot(seen[0], seen[1]), seen[2]), radius, altitude_m))
 
 
 def with_albedo(atmosphere: Atmosphere, values: np.ndarray) -> Atmosphere:

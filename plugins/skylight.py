@@ -23,7 +23,7 @@ class Skylight:
         """Take over the emitter's scales and tables."""
         self.sun_scale, self.sky_scale = self.emitter.scales
         self._light = self.emitter.sky_light
-        self.sun_density = self._light.sun_density
+        self.sun_density, self.sun_squeeze = self._light.sun_density, self._light.sun_squeeze
 
     def moved(self, solar: list[Any], sun_scale: float, sky_scale: float) -> Skylight:
         """The same for another solar irradiance and scales that are larger by so much."""
@@ -50,7 +50,8 @@ class Skylight:
         return self.emitter.world(self._light.sample_sun(sample))
 
     def sun_pdf(self, d: Any) -> Any:
-        """Density (1/sr) of :meth:`toward_sun`, which is the radiance of a sun of irradiance 1."""
+        """Density (1/sr) of :meth:`toward_sun`: times ``sun_squeeze`` the radiance of a sun that would have
+        irradiance 1 if it were round."""
         return self._light.sun_pdf(self.emitter.local(d))
 
     def sample_sky(self, sample: Any, active: Any) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from atmo_jit import AtmosphereError, earth_at
-from atmo_jit.refraction import REFRACTIVITY, apparent_zenith, bending
+from atmo_jit.refraction import REFRACTIVITY, apparent_zenith, bending, flattening
 
 
 def test_away_from_the_horizon_it_is_laplaces() -> None:
@@ -34,3 +34,25 @@ def test_true_and_apparent_agree() -> None:
     assert np.all(np.diff(seen) > 0.0) and seen[4] < np.pi / 2 < seen[5]
     with pytest.raises(AtmosphereError, match="altitude_m: found 100000"):
         bending("earth", 1.0, 1e5)
+
+
+def test_flattening_on_the_horizon_is_biots() -> None:
+    # Biot: on the horizon of the observer's own level a small disc is flattened to 1 - k, k the curvature of the ray
+    # there over the planet's, radius times refractivity over scale height where density is exponential.
+    air = earth_at([550.0], None)
+    curvature = REFRACTIVITY * air.bottom_radius_m / air.rayleigh.profile.scale_height_m
+    assert float(flattening(air, np.pi / 2, 1e-4)) == pytest.approx(1.0 - curvature, rel=1e-3)
+    assert float(flattening(air, np.radians(92.0), 1e-4)) == float(flattening(air, np.pi / 2, 1e-4))
+
+
+def test_the_sun_is_flat_on_the_horizon_and_round_at_the_zenith() -> None:
+    # What is seen is 0.83 or so. An exponential density falls faster near the ground than a troposphere's: 0.81.
+    radius = np.radians(0.2678)
+    resting, zenith = flattening("earth", [np.pi / 2 - 0.8 * radius, 0.01], radius)
+    assert 0.80 < resting < 0.90
+    assert zenith == pytest.approx(1.0, abs=1e-3)
+    # The limbs are where they are seen.
+    centre = np.pi / 2 - 1.5 * radius
+    true = centre + float(bending("earth", centre))
+    high, low = apparent_zenith("earth", [true - radius, true + radius])
+    assert float(flattening("earth", centre, radius)) == pytest.approx((low - high) / (2.0 * radius), rel=2e-3)

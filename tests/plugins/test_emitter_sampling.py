@@ -6,7 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from emitters import LUMINANCE, columns, plane, sampled, sun
+from emitters import LUMINANCE, columns, plane, sampled, seen, sun
+
+from atmo_jit.plugins.lookup import SunLookup
+from atmo_jit.plugins.panorama import Disc
 
 # Significance of one chi-squared test; with a dozen of them a false alarm is still rarer than one in 800 runs, and the
 # random numbers are the same in every run.
@@ -121,6 +124,51 @@ def test_sun_is_sampled_evenly(emitter) -> None:
     pdf = np.array(ds.pdf)[offset < 0.999]  # at the limb itself rounding decides
     assert np.ptp(pdf) < 1e-3 * pdf.mean()
     assert pdf.mean() == pytest.approx(share / solid, rel=5.0 * np.sqrt((1.0 - share) / (share * SAMPLES)) + 1e-4)
+
+
+def test_refraction_flattens_the_sun(emitter) -> None:
+    # -0.2 degrees: seen at 0.35, whole above the horizon.
+    flat = emitter(-0.2, refraction=True, sky_scale=0.0)
+    squeeze = flat.sky_light.disc.squeeze
+    assert 0.80 < squeeze < 0.83
+    centre = flat.sun
+    up = np.array([-centre[2], 0.0, centre[0]])
+    chord = 2.0 * np.sin(np.radians(0.2678) / 2.0)
+    ds, weight = sampled(flat, SAMPLES)
+    d = columns(ds.d)
+    high, across = (d - centre) @ up / chord, d[:, 1] / chord
+    assert np.abs(across).max() == pytest.approx(1.0, abs=2e-3)
+    assert np.abs(high).max() == pytest.approx(squeeze, abs=2e-3)
+    distance2 = (high / squeeze) ** 2 + across**2
+    assert distance2.max() < 1.0 + 1e-3
+    assert chi_squared(np.histogram(distance2, 16, (0.0, 1.0 + 1e-9))[0], np.full(16, SAMPLES / 16.0)) > SIGNIFICANCE
+    within = distance2 < 0.999
+    np.testing.assert_allclose(np.array(ds.pdf)[within], 1.0 / (np.pi * chord**2 * squeeze), rtol=1e-3)
+    # Radiance is that of a round sun, here of one with the same centre: the irradiance is less by the squeeze.
+    lifted = emitter(float(np.degrees(np.arcsin(centre[2]))), sky_scale=0.0)
+    middle = np.array([centre])
+    np.testing.assert_allclose(seen(flat, middle), seen(lifted, middle), rtol=1e-3)
+    power, of_round = (columns(w).mean(axis=0) @ LUMINANCE for w in (weight, sampled(lifted, SAMPLES)[1]))
+    assert power / of_round == pytest.approx(squeeze, rel=0.01)  # blue light of the lower limb counts less: it is dim
+    edges = centre + chord * np.array([0.98 * squeeze * up, 1.02 * squeeze * up, [0.0, 0.98, 0.0], [0.0, 1.02, 0.0]])
+    np.testing.assert_array_equal(seen(flat, edges)[:, 0] > 0.0, [True, False, True, False])
+    np.testing.assert_array_equal(density(flat, edges) > 1.0, [True, False, True, False])
+
+
+def test_a_wide_flat_disc_with_mitsubas_own_test(rgb: None) -> None:
+    direction = np.array(sun(40.0, 20.0))
+    disc = Disc(np.radians(35.0), 0.0, 1.0, np.zeros((1, 1, 1)), np.zeros(1), squeeze=0.5)
+    look, centre = SunLookup(disc, direction), mi.Vector3f(*direction.tolist())
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(),
+        sample_func=lambda x: look.sample(x, centre),
+        pdf_func=lambda d: dr.select(look.distance2(d, centre) <= 1.0, look.density, 0.0),
+        sample_dim=2,
+        sample_count=200_000,
+        res=55,
+        ires=32,
+    )
+    assert test.run(SIGNIFICANCE, quiet=True), test.messages
 
 
 @pytest.mark.parametrize("elevation_deg", [45.0, 0.0, -40.0])

@@ -214,6 +214,24 @@ def test_textures_and_height_fields(rgb):
     assert_agree(*found)
 
 
+@pytest.mark.parametrize("target", [[1.0, 0.0, 0.006], [-1.0, 0.0, 0.1]])
+def test_a_flattened_sun_shines_as_the_emitter_does(rgb, target):
+    """Seen from an origin that looks at the sun, and on a wall behind it that faces the sun."""
+    wall = mi.ScalarTransform4f().look_at([-1, 0, 0], [1, 0, 0], [0, 0, 1])
+    seen = []
+    for integrator in ("path", "atmosphere_path"):
+        scene = {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "sky": {"type": "atmosphere", "sun_direction": [1.0, 0.0, -0.0035], "refraction": True, "sky_scale": 1e-6},
+            "sensor": camera(16, 16, [0, 0, 0], target, fov=1.0),
+            "wall": {"type": "rectangle", "to_world": wall, "bsdf": {"type": "diffuse"}},
+        }
+        seen.append(np.array(mi.render(mi.load_dict(scene), spp=256))[..., :3].mean(axis=(0, 1)))
+    assert seen[1].max() > 1e-3
+    np.testing.assert_allclose(*seen, rtol=0.01)
+
+
 @pytest.mark.parametrize("altitude", [2.0, 50e3, 400e3])
 def test_without_shapes_the_picture_is_the_sky(rgb, altitude):
     size, parts = 16, 8
