@@ -34,3 +34,9 @@ def test_true_and_apparent_agree() -> None:
     assert np.all(np.diff(seen) > 0.0) and seen[4] < np.pi / 2 < seen[5]
     with pytest.raises(AtmosphereError, match="altitude_m: found 100000"):
         bending("earth", 1.0, 1e5)
+
+
+def test_a_disc_on_the_horizon_is_flattened_by_a_sixth():
+    radius = 0.2678
+    top, bottom = np.degrees(apparent_zenith("earth", np.radians([90.0 - radius, 90.0 + radius])))
+    assert (bottom - top) / (2.0 * radius) == pytest.approx(5.0 / 6.0, abs=0.01)
