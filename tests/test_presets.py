@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -60,3 +63,39 @@ def test_mars_has_the_optical_depth_it_claims_and_a_blue_aureole():
     forward = dust.scattering_per_m * dust.phase.value(1.0)
     sideways = dust.scattering_per_m * dust.phase.value(0.0)
     assert forward[2] > forward[1] > forward[0] and sideways[2] < sideways[1] < sideways[0]
+
+
+PAGE = (Path(__file__).parents[1] / "docs" / "presets.md").read_text(encoding="utf-8")
+COMMON = {"wavelengths_nm", "solar_irradiance", "sun_angular_radius_deg"}
+"""What the page's head describes for all presets."""
+
+
+@pytest.mark.parametrize("name", presets.NAMES)
+def test_every_value_has_its_source_on_the_page(name):
+    head, *sections = re.split(r"^## ", PAGE, flags=re.MULTILINE)
+    (section,) = [section for section in sections if f"`{name}`" in section.splitlines()[0]]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    described = {key for row in rows for key in re.findall(r"`(\w+)`", row)}
+    assert described == {key for key, value in presets.read(name).items() if value is not None} - COMMON
+    assert all(f"`{key}`" in head for key in COMMON)
+
+
+def test_mars_has_the_gas_it_claims():
+    """Carbon dioxide of Sneep and Ubachs 2005: refractivity at 15 C and 1013.25 hPa, King factor; cm^-1."""
+    mars = Atmosphere.load("mars")
+    wavenumber = 1e7 / mars.wavelengths_nm
+    strengths = [5799.25, 120.05, 5.3334, 4.3244, 1.218145e-5]
+    poles = [128908.9, 89223.8, 75037.5, 67837.7, 2418.136]
+    index = 1 + 1.1427e3 * sum(a / (pole**2 - wavenumber**2) for a, pole in zip(strengths, poles, strict=True))
+    lorentz = (index**2 - 1) / (index**2 + 2)
+    king = 1.1364 + 25.3e-12 * wavenumber**2
+    section = 24 * np.pi**3 * (100 * wavenumber) ** 4 / 2.546899e25**2 * lorentz**2 * king
+    per_m3 = 610 / (1.380649e-23 * 210)
+    np.testing.assert_allclose(mars.get("rayleigh.scattering_per_m"), section * per_m3, rtol=2e-3)
+
+
+def test_haze_has_the_gas_it_claims():
+    haze = Atmosphere.load("haze")
+    air = earth_at(haze.wavelengths_nm, "continental").get("rayleigh.scattering_per_m")
+    denser = 1.47 / 1.01325 * 288.15 / 94
+    np.testing.assert_allclose(haze.get("rayleigh.scattering_per_m"), denser * np.asarray(air), rtol=2e-3)
