@@ -32,6 +32,7 @@ POOR = 5.0  # residual over sigma, and
 POOR_LOG = 0.15  # relative residual, above both of which other starting values are tried
 ROUNDS = 12  # of loss and weights, each of
 FIRST_ITERATIONS = 10
+LAST_ROUNDS = 3
 STEPS_FORESEEN = 3
 ALIKE = 1.1  # ratio of weights within which they are not worth another round
 MODEL_ERRS = 1.5  # variance of residuals over sigma from which on the model, and not noise, keeps them apart
@@ -166,11 +167,19 @@ def _minimum(few: Problem, start: np.ndarray, report: Report) -> _End:
 
 
 def _polished(whole: Problem, report: Report) -> _End:
-    """The minimum for all samples, on nodes and with weights for the atmosphere that the report's point names."""
+    """The minimum for all samples, on nodes for the atmosphere that the report's point names, and with weights at first
+    for it, then for what is left at the minimum: where parameters do the same to the data, priors decide, whose weight
+    against the data this is."""
     nodes, u = np.array(report.point.nodes), np.array(report.point.u)
     whole.model.place(whole.atmosphere_values(nodes))
     problem = _weighed(whole, nodes)
     last = _solve(problem, u, report, STEP_TOLERANCE)
+    for _ in range(LAST_ROUNDS):
+        weights = _weights(problem, _End(problem, last).left)
+        if _alike(weights, (problem.huber, problem.excess)):
+            break
+        problem = problem.with_loss(*weights)
+        last = _solve(problem, last.u, report, STEP_TOLERANCE, known=(last.u, last.jacobian))
     return _End(problem, replace(last, iterations=report.iterations))
 
 
