@@ -32,7 +32,7 @@ from .optics import MAX_CHANNELS, Optics
 from .parameters import check_names
 from .pieces import Pieces, light_along
 from .resolution import Resolution
-from .single_scattering import ground_light, horizontal_irradiance
+from .single_scattering import exact_sun_irradiance, ground_light, horizontal_irradiance
 from .views import check_views, side_by_side
 
 # Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
@@ -278,13 +278,17 @@ class Sky:
         """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``:
         lists of W Floats."""
         t = types()
-        h, mu_s = t.Float(altitude_m), t.Float(dr.cos(t.Float64(sun_zenith)))
+        exact = t.Float64(altitude_m), dr.cos(t.Float64(sun_zenith))
+        h, mu_s = (t.Float(v) for v in exact)
         h = dr.minimum(h + 0.0 * mu_s, self._bands[0].optics.thickness)
         dr.make_opaque(h, mu_s)
         sun, sky = [], []
         for band in self._bands:
             band.field.prepare()
             direct, scattered = horizontal_irradiance(band.optics, band.columns, band.field, h, mu_s)
+            if band.optics.exact is not None and not dr.grad_enabled(exact):
+                altitude = dr.minimum(exact[0] + 0.0 * exact[1], band.optics.exact.thickness)
+                direct = exact_sun_irradiance(band.optics.exact, band.columns, altitude, exact[1] + 0.0 * altitude)
             sun += direct
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky

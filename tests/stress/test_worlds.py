@@ -47,14 +47,14 @@ def test_a_horizontal_sun_shines_into_the_top_of_a_layer():
 
 
 # 3011: observers 4 cm under the edge of fog at 39 km. 72: a ray that grazes a step of density 29,500 km up had another
-# transmittance back than forth, by 0.03. 75: halves of a ray through steps, by 0.003.
-@pytest.mark.parametrize("number", [72, 75, 3011])
+# transmittance back than forth, by 0.03. 75: halves of a ray through steps, by 0.003. 137: the sun from beside one.
+@pytest.mark.parametrize("number", [72, 75, 137, 3011])
 def test_steps_of_density_are_where_they_are(number):
     """Nearer to an observer or to a perigee than altitudes in single precision can be: Optics.exact."""
     rng = Random(number)
     air = extreme_world(rng)
     errors = check_world(air, extreme_views(rng, air, PER_WORLD), Twin(air), solves=False)
-    for name in ("reciprocity", "additivity", "transmittance, twin"):
+    for name in ("reciprocity", "additivity", "transmittance, twin", "sun irradiance, twin"):
         assert np.max(errors[name], initial=0.0) < 1e-4, name
 
 
