@@ -25,9 +25,9 @@ from .backend import (
 )
 from .column import SunColumns
 from .field import Field
-from .geometry import safe_sine
+from .geometry import distance_up, safe_sine
 from .grid import Grid
-from .march import Rays, point_along, visible_sun
+from .march import Rays, march, point_along, visible_sun
 from .optics import PHASE_NODES, Optics, phase_node
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
@@ -258,6 +258,18 @@ def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> li
     cosine = disc_cosine(mu_s, optics.sun_radius)
     depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
     return [solar * cosine * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
+
+
+def exact_sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> list[Any]:
+    """The same by a march in double precision, for Optics.exact and Float64 ``h`` and ``mu_s``: beside a step of
+    density, the table of columns is too coarse."""
+    t, r = types(), optics.radius + h
+    mu = dr.maximum(mu_s, -dr.safe_sqrt(h * (2.0 * optics.radius + h)) / r)
+    stop = distance_up(optics.radius, h, mu, optics.thickness)
+    rays = Rays(h, mu, mu, dr.zeros(t.Float64, 1) + 1.0, stop, t.Bool(False))
+    through = march(optics, columns, rays, single=False).transmittance
+    cosine = disc_cosine(t.Float(mu_s), optics.sun_radius)
+    return [solar * cosine * value for solar, value in zip(optics.solar, through, strict=True)]
 
 
 def disc_cosine(mu_s: Any, radius: Any) -> Any:
