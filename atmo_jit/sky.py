@@ -142,7 +142,7 @@ class Sky:
             optics, grid = band.optics.with_values(new), self.grid
             toward_sun = sun_columns(optics, grid, columns[i])
             of_solve = known and known[i]
-            done.append(orders_again(optics, toward_sun, grid, self.resolution, len(shares[i]) + 1, of_solve))
+            done.append(orders_again(optics, toward_sun, grid, self.resolution, shares[i], of_solve))
         return done
 
     def again(
