@@ -78,11 +78,12 @@ def solve(
         weights = arriving.copy()
         weights[-1] = 0.0
     shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
-    parts = steps.finish(values, done, later, shares)
+    parts, finishing = steps.finish(values, done, later, shares, noting=noting, extrapolated=noting and orders is None)
     field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
     if noting:
         field.known = {"reference": done["reference"], "first": done["first"], "later": later}
         field.known["tables"] = [table for some in tables for table in some]
+        field.known["finishing"] = finishing
     return field
 
 
@@ -92,7 +93,8 @@ def orders_again(
     """The light of ``count`` orders, as solve_again takes it, for values of the optics that carry derivatives.
     ``known``: what a solve for these very values found (Field.known). Nothing in here waits for a result."""
     steps = _Steps(optics, columns, grid, resolution)
-    return steps.started(optics.values(resolution.degrees, resolution.phase_degree), count, known)
+    started = steps.started(optics.values(resolution.degrees, resolution.phase_degree), count, known)
+    return {**started, "finishing": known["finishing"]} if known else started
 
 
 def solve_again(
@@ -109,9 +111,8 @@ def solve_again(
     values = optics.values(resolution.degrees, resolution.phase_degree)
     optics = optics.with_values(values)
     steps = _Steps(optics, columns, grid, resolution)
-    parts = steps.finished(
-        values, done["reference"], done["first"], done["later"], shares, extrapolated=orders is None
-    )
+    of_orders = (done[name] for name in ("reference", "first", "later"))
+    parts = steps.finished(values, *of_orders, shares, extrapolated=orders is None, known=done.get("finishing"))
     return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
 
 
@@ -214,17 +215,26 @@ class _Steps:
         light = Moments(light, *self._degree(n), suns, channels)
         return np.swapaxes(light.numpy()[:, :2, :suns] * inverse, 1, 2)
 
-    def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
-        """What Field holds: moments, sky and reflected irradiance."""
-        return self._run(
-            ("finish", len(later)),
-            lambda v, reference, first, later, shares: self.finished(v, reference, first, later, shares),
-            values,
-            done["reference"],
-            done["first"],
-            later,
-            shares,
-        )
+    def finish(
+        self,
+        values: Any,
+        done: dict[str, Any],
+        later: list[Any],
+        shares: list[Any],
+        *,
+        noting: bool,
+        extrapolated: bool,
+    ) -> tuple[Any, ...]:
+        """What Field holds: moments, sky and reflected irradiance; and all tables if they are noted. ``extrapolated``:
+        with shares that carry derivatives (total.following)."""
+
+        def finish(*arguments: Any) -> tuple[Any, ...]:
+            with noted.noting() as tables:
+                parts = self.finished(*arguments, extrapolated=extrapolated)
+            return parts, tables if noting else []
+
+        key = "finish", len(later), noting, extrapolated
+        return self._run(key, finish, values, done["reference"], done["first"], later, shares)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
@@ -288,9 +298,13 @@ class _Steps:
         later: list[Any],
         shares: list[Any],
         *,
-        extrapolated: bool = False,
+        extrapolated: bool,
+        known: list[Any] | None = None,
     ) -> tuple[Any, ...]:
         """The same, traced."""
+        if known is not None:
+            with noted.knowing(known):
+                return self.finished(values, reference, first, later, shares, extrapolated=extrapolated)
         optics, grid = self._optics.with_values(values), self._grid
         channels = optics.channel_count
         reference = Reference.of(grid, channels, reference)
