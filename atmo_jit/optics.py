@@ -122,12 +122,19 @@ class Optics:
             made["moment_tables"] = {degree: self.scatterers_moments(degree, atmosphere) for degree in degrees}
         return made
 
-    def by_channel(self, part: Any) -> np.ndarray:
-        """Sums over one entry of ``numbers``, of what belongs to each channel."""
-        if isinstance(part, dict):
-            return sum(table.sum(axis=0).reshape(-1, self.channel_count).sum(axis=0) for table in part.values())
-        rows = part if part and isinstance(part[0], list) else [part]
-        return sum((np.array(row) for row in rows if len(row) == self.channel_count), np.zeros(self.channel_count))
+    def channels(self, numbers: dict[str, Any]) -> list[int | None]:
+        """Which channel each leaf of ``numbers`` belongs to; None: to none, or to all, as a table does."""
+
+        def of(part: Any) -> list[int | None]:
+            if isinstance(part, dict):
+                return [channel for inner in part.values() for channel in of(inner)]
+            if not isinstance(part, list):
+                return [None]
+            if part and isinstance(part[0], list):
+                return [channel for inner in part for channel in of(inner)]
+            return list(range(len(part))) if len(part) == self.channel_count else [None] * len(part)
+
+        return of(numbers)
 
     def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
         """Everything that kernels read of an atmosphere, with phase moments up to ``degrees``."""

@@ -46,8 +46,8 @@ class Resolution:
     their paths. ``first_*``: the same for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase
     functions there; ``beam_*``: altitude levels per interval, azimuths and Gauss points at which sunlight is followed,
     phase functions apart.
-    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``:
-    size of the sun-column table (altitudes, cosines).
+    ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
+    steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
     """
 
     altitudes: int = 12
@@ -65,7 +65,7 @@ class Resolution:
     beam_refine: int = 2
     beam_azimuths: int = 4
     beam_nodes: int = 2
-    orders: int = 100
+    orders: int = 40
     converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
 

@@ -124,7 +124,7 @@ def beam_along(
         cos_turn, sin_turn = packet(device.turns, visit, 2)
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
+    def visit(i: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
         weight = row(weights.scattered, i, kinds * channels, alone=True) if kinds else []
         level = dr.gather(t.UInt, device.level, i)
         lights = [beam.at(level, mu) for mu in turned(i)]
@@ -132,24 +132,20 @@ def beam_along(
             [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
             for light, old in zip(lights, sums, strict=True)
         ]
-        # As a sum, like all that derivatives pass backwards through such a loop.
-        ends = dr.select(i + 1 < stop, t.Float(0.0), 1.0)
-        last = [
-            [dr.fma(ends, value, s) for value, s in zip(light, old, strict=True)]
-            for light, old in zip(lights, last, strict=True)
-        ]
-        return i + 1, new, last
+        return i + 1, new
 
     def zeros(count: int) -> list[list[Any]]:
         return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(together)]
 
+    _, sums = dr.while_loop(
+        (start, zeros(kinds * channels)), lambda i, _: i < stop, visit, max_iterations=-1, label="beam"
+    )
     # Light at the last visit is that of the ground, where the path ends there.
-    state = (start, zeros(kinds * channels), zeros(channels))
-    _, sums, last = dr.while_loop(state, lambda i, *_: i < stop, visit, max_iterations=-1, label="beam")
+    level = dr.gather(t.UInt, device.level, stop - 1)
     reflected = row(weights.reflected, stop - 1, channels)
     ground = []
-    for mu, light in zip(turned(stop - 1), last, strict=True):
-        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, light, strict=True)]
+    for mu in turned(stop - 1):
+        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, beam.at(level, mu), strict=True)]
     scattered = [value for part in sums for value in part] or [t.Float(0.0)]
     return tuple(tables_of([scattered, ground], lane))
 

@@ -35,9 +35,9 @@ from .resolution import Resolution
 from .single_scattering import exact_sun_irradiance, ground_light, horizontal_irradiance
 from .views import check_views, side_by_side
 
-# Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
-# stand for those left out, carry none.
-SURE = 0.003
+# Share of the usual remainder that is left where derivatives are wanted, and fine ones: those of the light that orders
+# left out would add are less exact than that light.
+SURE, FINE = 0.03, 0.003
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
@@ -76,7 +76,7 @@ class Sky:
     be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
     used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
     :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
-    orders are solved, for derivatives (SURE); ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
+    orders are solved, for derivatives; ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
     InputError.
     """
 
@@ -105,7 +105,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance, fine=fine)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        remainder = SURE * tolerance if sure else tolerance
+        remainder = (FINE if fine else SURE) * tolerance if sure else tolerance
         self._bands: list[_Band] = []
         for band, values in zip(bands, held or [None] * len(bands), strict=True):
             optics = Optics(self.atmosphere, band, scattering_too)
@@ -123,10 +123,14 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns)
 
-    def columns_again(self, values: list[dict[str, Any]]) -> list[Any]:
-        """The tables of SunColumns for other ``values`` (Optics.values) of the bands."""
-        of_bands = zip(self._bands, values, strict=True)
-        return [sun_columns(band.optics.with_values(new), self.grid).table for band, new in of_bands]
+    def columns_again(self, values: list[dict[str, Any]], known: list[Any] | None = None) -> list[Any]:
+        """The tables of SunColumns for other ``values`` (Optics.values) of the bands, which may carry derivatives;
+        ``known``: their numbers."""
+        tables = []
+        for i, (band, new) in enumerate(zip(self._bands, values, strict=True)):
+            optics = band.optics.with_values(new)
+            tables.append(sun_columns(optics, self.grid, known=known[i] if known else None).table)
+        return tables
 
     def orders_again(
         self,
@@ -142,7 +146,7 @@ class Sky:
             optics, grid = band.optics.with_values(new), self.grid
             toward_sun = sun_columns(optics, grid, columns[i])
             of_solve = known and known[i]
-            done.append(orders_again(optics, toward_sun, grid, self.resolution, len(shares[i]) + 1, of_solve))
+            done.append(orders_again(optics, toward_sun, grid, self.resolution, shares[i], of_solve))
         return done
 
     def again(
