@@ -259,7 +259,7 @@ def march(
     optics, where they cannot be made because a kernel is being traced. Where rays are and where they are cut is
     computed in the precision of the rays and of the optics (Optics.exact).
     """
-    t = types()
+    t, wide = types(), type(rays.h)
     c_count, k_count = optics.channel_count, len(optics.constituents)
     width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
     if k_count == 0:
@@ -308,7 +308,9 @@ def march(
             at = dr.fma(length, dr.select(total > 0.0, centroid / total, 0.5), d)
             h, r, mu_s = point_along(optics, rays, at)
             mu = dr.clip((r_mu + at) / r, -UPRIGHT, UPRIGHT)
-            h, mu_s, mu, cos_phi = (t.Float(v) for v in (h, mu_s, mu, relative_azimuth(mu, mu_s, rays.nu)))
+            h, mu_s, mu = (t.Float(v) for v in (h, mu_s, mu))
+            # Of these cosines: light is linear in sin * cos(azimuth) beside the zenith, however they are rounded.
+            cos_phi = t.Float(relative_azimuth(wide(mu), wide(mu_s), rays.nu))
             toward = source.scattered(h, mu_s, mu, cos_phi, total > 0.0)
             for n in range(len(optics.scatterers)):
                 for c in range(c_count):
