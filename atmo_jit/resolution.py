@@ -19,7 +19,8 @@ MANY = 20  # events; light that has as many is lost by what each order lacks
 # Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
-FINE_DEGREES, FINE_ALTITUDES = 4, 4  # more for derivatives that are to be as exact as the light
+# More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
+FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 4, 1.3, 8, 12
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -94,13 +95,14 @@ class Resolution:
         level = int(np.searchsorted(-np.array(FINER), -tolerance))
         altitudes = (8, 10, 12, 16)[level]
         if fine:
-            first = next((degree for degree in FIRST_DEGREES if degree >= first + FINE_DEGREES), FIRST_DEGREES[-1])
+            needed = max(first + FINE_DEGREES, FINE_TIMES * first)
+            first = next((degree for degree in FIRST_DEGREES if degree >= needed), FIRST_DEGREES[-1])
             up = max(10, 2 * first // 3)
             stages = [replace(stages[0], degree=first, up=up, down=up - 2)]
             altitudes += FINE_ALTITUDES
         return cls(
             altitudes=_altitudes(atmosphere, altitudes, thick),
-            suns=(21, 25, 29, 33)[level],
+            suns=(21, 25, 29, 33)[level] + (FINE_SUNS if fine else 0),
             first_suns=(1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
             stages=tuple(dict.fromkeys(stages)),
