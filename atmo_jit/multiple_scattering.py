@@ -83,13 +83,15 @@ def solve(
     if tail is not None:
         later.append(rest)
         shares = [[floats(np.ones_like(w)), floats(np.ones_like(w))] for w in [*weights, weights[0]]]
-    parts = steps.finish(values, done, later, shares)
+    extrapolated = noting and orders is None and tail is None
+    parts, finishing = steps.finish(values, done, later, shares, noting=noting, extrapolated=extrapolated)
     if tail is not None:
         shares[-1] = {**tail, "shares": shares[-1]}
     field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
     if noting:
         field.known = {"reference": done["reference"], "first": done["first"], "later": later}
         field.known["tables"] = [table for some in tables for table in some]
+        field.known["finishing"] = finishing
     return field
 
 
@@ -106,7 +108,8 @@ def orders_again(
     result."""
     steps = _Steps(optics, columns, grid, resolution)
     values = optics.values(resolution.degrees, resolution.phase_degree)
-    return steps.started(values, len(shares) + 1, known, parted(shares)[1])
+    started = steps.started(values, len(shares) + 1, known, parted(shares)[1])
+    return {**started, "finishing": known["finishing"]} if known else started
 
 
 def solve_again(
@@ -125,9 +128,9 @@ def solve_again(
     steps = _Steps(optics, columns, grid, resolution)
     counts, tail = parted(shares)
     extrapolated = orders is None and tail is None
-    parts = steps.finished(
-        values, done["reference"], done["first"], done["later"], counts, extrapolated=extrapolated
-    )
+    of_orders = (done[name] for name in ("reference", "first", "later"))
+    known = done.get("finishing")
+    parts = steps.finished(values, *of_orders, counts, extrapolated=extrapolated, known=known)
     return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
 
 
@@ -238,17 +241,26 @@ class _Steps:
         light = Moments(light, *self._degree(n), suns, channels)
         return np.swapaxes(light.numpy()[:, :2, :suns] * inverse, 1, 2)
 
-    def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
-        """What Field holds: moments, sky and reflected irradiance."""
-        return self._run(
-            ("finish", len(later)),
-            lambda v, reference, first, later, shares: self.finished(v, reference, first, later, shares),
-            values,
-            done["reference"],
-            done["first"],
-            later,
-            shares,
-        )
+    def finish(
+        self,
+        values: Any,
+        done: dict[str, Any],
+        later: list[Any],
+        shares: list[Any],
+        *,
+        noting: bool,
+        extrapolated: bool,
+    ) -> tuple[Any, ...]:
+        """What Field holds: moments, sky and reflected irradiance; and all tables if they are noted. ``extrapolated``:
+        with shares that carry derivatives (total.following)."""
+
+        def finish(*arguments: Any) -> tuple[Any, ...]:
+            with noted.noting() as tables:
+                parts = self.finished(*arguments, extrapolated=extrapolated)
+            return parts, tables if noting else []
+
+        key = "finish", len(later), noting, extrapolated
+        return self._run(key, finish, values, done["reference"], done["first"], later, shares)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
@@ -321,9 +333,13 @@ class _Steps:
         later: list[Any],
         shares: list[Any],
         *,
-        extrapolated: bool = False,
+        extrapolated: bool,
+        known: list[Any] | None = None,
     ) -> tuple[Any, ...]:
         """The same, traced."""
+        if known is not None:
+            with noted.knowing(known):
+                return self.finished(values, reference, first, later, shares, extrapolated=extrapolated)
         optics, grid = self._optics.with_values(values), self._grid
         channels = optics.channel_count
         reference = Reference.of(grid, channels, reference)
