@@ -32,6 +32,8 @@ from .total import following, total_of
 
 LEAST = 1e-6  # of the light: an order that is less says nothing of those that follow
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
+FEW, LACKING = 16, 0.03  # orders after which so much of the light must not lack, if a few more are to do
+REST = 0.1  # of what a sum of orders may lack, that the remainder may: another turn costs little
 
 
 def solve(
@@ -48,8 +50,8 @@ def solve(
     observer.
 
     ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
-    soon as that is steady to ``tolerance``; where ``resolution.orders`` do not make it so, those that follow are solved
-    for at once (remainder.found). The field's sky irradiance counts one event more than its moments.
+    soon as that is steady to ``tolerance``; where that is not soon, those that follow are solved for at once
+    (remainder.found). The field's sky irradiance counts one event more than its moments.
     ``noting``: the field gets what ``solve_again`` need not compute once more, Field.known.
     """
     steps = _Steps.of(optics, columns, grid, resolution)
@@ -66,9 +68,9 @@ def solve(
             arriving = weights
             if error < resolution.converged * tolerance:
                 break
-        if n == most:
+        if n == most or (orders is None and n >= FEW and error > LACKING):
             if orders is None and later:
-                tail, rest = steps.remainder(values, done, later[-1], n, resolution.converged * tolerance)
+                tail, rest = steps.remainder(values, done, later[-1], n, REST * resolution.converged * tolerance)
             break
         later.append(steps.step(values, done, later[-1], n + 1, noting=noting))
         tables.append(done["tables"])

@@ -14,7 +14,9 @@ import numpy as np
 from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
-MOST_ALTITUDES = 48
+DEEP = 8.0  # of what scatters nearly all light: there are
+MOST_ALTITUDES, DEEP_ALTITUDES = 48, 64
+THICK_DEGREE, DEEP_DEGREE = 16, 24  # of order 1
 MANY = 20  # events; light that has as many is lost by what each order lacks
 # Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
@@ -49,6 +51,7 @@ class Resolution:
     phase functions apart.
     ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
     steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
+    ``deep``: altitudes are denser at the top than at the bottom: all the light of a white cloud passes there twice.
     """
 
     altitudes: int = 12
@@ -69,6 +72,7 @@ class Resolution:
     orders: int = 40
     converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
+    deep: bool = False
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -88,8 +92,9 @@ class Resolution:
         later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
+        deep = float(np.max(np.multiply(*_scattering(atmosphere)))) > DEEP
         if thick:
-            first, later = min(first, 16), min(later, 8)
+            first, later = min(first, DEEP_DEGREE if deep else THICK_DEGREE), min(later, 8)
         first = next(degree for degree in FIRST_DEGREES if degree >= first)
         stages = [_stage(later), _stage((3 * later) // 4)]
         level = int(np.searchsorted(-np.array(FINER), -tolerance))
@@ -101,7 +106,8 @@ class Resolution:
             stages = [replace(stages[0], degree=first, up=up, down=up - 2)]
             altitudes += FINE_ALTITUDES
         return cls(
-            altitudes=_altitudes(atmosphere, altitudes, thick),
+            altitudes=_altitudes(atmosphere, altitudes, thick, deep),
+            deep=deep,
             suns=(21, 25, 29, 33)[level] + (FINE_SUNS if fine else 0),
             first_suns=(1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
@@ -161,15 +167,20 @@ def moments_of(phase: Any, degree: int) -> np.ndarray:
 _moments: dict[Any, np.ndarray] = {}
 
 
-def _altitudes(atmosphere: Atmosphere, clear: int, thick: bool) -> int:
+def _altitudes(atmosphere: Atmosphere, clear: int, thick: bool, deep: bool) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared; up to
     twice as many more in ``thick`` air, where what each order lacks adds up unless light is absorbed first."""
+    scattering, white = _scattering(atmosphere)
+    per_doubling = 8.0 * (1.0 + thick * white)
+    extra = float(np.max(per_doubling * np.log2(1.0 + np.maximum(scattering - 0.3, 0.0) / 2.0)))
+    return DEEP_ALTITUDES if deep else min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
+
+
+def _scattering(atmosphere: Atmosphere) -> tuple[np.ndarray, np.ndarray]:
+    """Vertical optical depth of what scatters [W], and the part of the light that is left after MANY events."""
     depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
     scattering, depth = sum(depths, start=np.zeros(1)), _depth(atmosphere)
-    albedo = np.divide(scattering, depth, out=np.zeros(depth.shape), where=depth > 0.0)
-    per_doubling = 8.0 * (1.0 + thick * albedo**MANY)
-    extra = float(np.max(per_doubling * np.log2(1.0 + np.maximum(scattering - 0.3, 0.0) / 2.0)))
-    return min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
+    return scattering, np.divide(scattering, depth, out=np.zeros(depth.shape), where=depth > 0.0) ** MANY
 
 
 def _depth(atmosphere: Atmosphere) -> np.ndarray:

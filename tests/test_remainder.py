@@ -5,10 +5,10 @@ import pytest
 
 import atmo_jit
 from atmo_jit.backend import floats, traversing
+from atmo_jit.fits.light import RayLight
 from atmo_jit.multiple_scattering import _Steps
 from atmo_jit.remainder import Remainder, parted
 from bench.worlds import world
-from fits.light import RayLight
 
 VIEWS = {
     "altitude_m": [0.0, 0.0, 20000.0, 20000.0],
