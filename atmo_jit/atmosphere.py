@@ -102,7 +102,11 @@ class Atmosphere:
     ozone: Constituent | None
 
     def __init__(self, description: Mapping[str, Any]) -> None:
-        document = plain(description)
+        self._read(plain(description), {}, {})
+
+    def _read(self, document: dict[str, Any], before: dict[str, Any], read: dict[str, Any]) -> None:
+        """Take what a ``document`` of dicts, lists and Python numbers describes. ``read``: constituents by name, of a
+        document ``before``, which serve where it has the very same object."""
         mapping(document, "", REQUIRED, tuple(DEFAULTS))
         d = DEFAULTS | document
         wavelengths = numbers(d["wavelengths_nm"], "wavelengths_nm", POSITIVE)
@@ -122,9 +126,10 @@ class Atmosphere:
             bottom_radius_m=bottom,
             top_radius_m=top,
             sun_angular_radius_deg=sun,
-            rayleigh=_rayleigh(d["rayleigh"], count),
-            mie=_mie(d["mie"], count),
-            ozone=_ozone(d["ozone"], count),
+            **{
+                name: read[name] if name in read and d[name] is before[name] else new(d[name], count)
+                for name, new in (("rayleigh", _rayleigh), ("mie", _mie), ("ozone", _ozone))
+            },
         )
 
     def _set(self, **fields: Any) -> None:
@@ -212,9 +217,13 @@ class Atmosphere:
         A key that excludes another (``profile`` and ``scale_height_m``, ``absorption_per_m`` and
         ``single_scattering_albedo``) takes its place.
         """
-        document = self.to_dict()
+        before = DEFAULTS | self._document
+        document = dict(before)
         for dotted, value in changes.items():
             *parents, key = dotted.split(".")
+            top = (parents or [key])[0]
+            if parents and document.get(top) is before.get(top, dotted):
+                document[top] = plain(before[top], top)
             node: Any = document
             for step in parents:
                 node = _child(node, step)
@@ -223,12 +232,16 @@ class Atmosphere:
                     excluded = other if key in one else one if key in other else set()
                     for name in excluded - {c.rpartition(".")[2] for c in changes if c.split(".")[:-1] == parents}:
                         node.pop(name, None)
-                node[key] = value
+                node[key] = plain(value, dotted)
             elif isinstance(_child(node, key), dict):
-                node[int(key)] = value
+                node[int(key)] = plain(value, dotted)
             else:
                 raise AtmosphereError(dotted, "no value of that name", f"the names {', '.join(self.names())}")
-        return Atmosphere(document)
+        read = {name: getattr(self, name) for name in ("rayleigh", "mie", "ozone")}
+        new = object.__new__(Atmosphere)
+        # Lists of another length belong to other wavelengths.
+        new._read(document, before, read if document["wavelengths_nm"] is before["wavelengths_nm"] else {})
+        return new
 
     def __eq__(self, other: object) -> bool:
         return self.to_dict() == other.to_dict() if isinstance(other, Atmosphere) else NotImplemented

@@ -21,7 +21,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, parameter, row, table_of, types
+from . import noted
+from .backend import floats, packet, parameter, row, sum_loop, table_of, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
 from .optics import Optics
@@ -29,6 +30,7 @@ from .profile import Exponential
 from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
+LEAST = 1e-37  # mean density of which a logarithm is made
 _CELLS = 4096  # of the look-up from altitude to shell, uniform in the square root of altitude
 
 
@@ -58,15 +60,16 @@ class SunColumns:
         self._rule = integration_rule(optics)
         self.table = table if table is not None else self._build() if self._count else None
 
-    def of(self, optics: Optics, table: Any = None) -> SunColumns:
+    def of(self, optics: Optics, table: Any = None, known: Any = None) -> SunColumns:
         """The table for other optics with profiles of the same kind, cut at the same altitudes; ``table``: its
-        numbers, where they are known already."""
+        numbers, which carry derivatives, ``known``: which do not, where they are known already."""
         other = copy(self)
         other.optics = optics
-        other.table = table if table is not None else other._build() if self._count else None
+        other.table = table if table is not None else other._build(known) if self._count else None
         return other
 
-    def _build(self) -> Any:
+    def _build(self, known: Any = None) -> Any:
+        """The table. ``known``: its numbers; then only derivatives are made."""
         t = types()
         rows, cosines = self._rows + 1, self._cosines
         lane = dr.arange(t.UInt, self._shells * rows * cosines)
@@ -79,11 +82,20 @@ class SunColumns:
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         # Where the path has no length: that on this shell's side of the break.
         at_top = self.optics.densities(dr.fma(low - high, dr.maximum(x, 1e-3) ** 2, high))
-        means = []
-        for k, total in enumerate(totals):
-            mean = dr.select(path > 0.0, total / dr.select(path > 0.0, path, 1.0), at_top[k])
-            means.append(dr.log(dr.maximum(mean, 1e-37)) if self._logarithmic[k] else mean)
-        return table_of(means, lane)
+        per_path = dr.select(path > 0.0, 1.0 / dr.select(path > 0.0, path, 1.0), 0.0)
+        means = [dr.select(path > 0.0, total * per_path, top) for total, top in zip(totals, at_top, strict=True)]
+        if known is None:
+            flags = zip(means, self._logarithmic, strict=True)
+            means = [dr.log(dr.maximum(mean, LEAST)) if log else mean for mean, log in flags]
+            return table_of(means, lane)
+        # The derivative of a logarithm needs its number alone: the integral is not computed again.
+        logs = row(known, lane, self._count)
+        slopes = [
+            dr.select(v > np.log(2.0 * LEAST), dr.exp(-v), 0.0) if log else 1.0
+            for v, log in zip(logs, self._logarithmic, strict=True)
+        ]
+        with noted.knowing([known]):
+            return table_of([slope * mean for slope, mean in zip(slopes, means, strict=True)], lane)
 
     def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
         """Column density (m) of every constituent from altitude ``h`` to the top in direction ``mu`` of either sign.
@@ -151,12 +163,12 @@ class SunColumns:
         return result
 
 
-def sun_columns(optics: Optics, grid: Grid, table: Any = None) -> SunColumns:
-    """The table for an atmosphere, kept with the grid unless the profiles carry derivatives; ``table``: its numbers,
-    which carry those then."""
+def sun_columns(optics: Optics, grid: Grid, table: Any = None, known: Any = None) -> SunColumns:
+    """The table for an atmosphere, kept with the grid unless the profiles carry derivatives; ``table``, ``known``: see
+    SunColumns.of."""
     with dr.suspend_grad():
         columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
-    return columns.of(optics, table) if optics.profiles_differentiable else columns
+    return columns.of(optics, table, known) if optics.profiles_differentiable else columns
 
 
 def integration_rule(optics: Optics) -> tuple[Any, Any]:
@@ -169,19 +181,20 @@ def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = No
     profile's breaks. ``rule``: see integration_rule."""
     t, count = types(), NODES_PER_LAYER
     breaks, nodes = rule or integration_rule(optics)
+    optics = optics.spread(dr.width(h))
 
     # One node per pass, not one layer: a quarter of the code to compile.
-    def add(index: Any, totals: list[Any]) -> tuple[Any, list[Any]]:
+    def add(index: Any, totals: list[Any], profiles: list[Any]) -> tuple[Any, list[Any]]:
         low, high = (dr.maximum(dr.gather(t.Float, breaks, index // count + i), h) for i in (0, 1))
         node, weight = packet(nodes, index % count, 2)
         start = distance_up(optics.radius, h, mu, low)
         length = distance_up(optics.radius, h, mu, high) - start
         there, _ = altitude_along(optics.radius, h, mu, dr.fma(length, node, start))
         length = length * weight
-        densities = optics.densities(there)
+        densities = optics.with_values({"profiles": profiles}).densities(there)
         return index + 1, [dr.fma(length, d, total) for d, total in zip(densities, totals, strict=True)]
 
     last = dr.opaque(t.UInt, count * (dr.width(breaks) - 1), 1)
     zero = [dr.zeros(t.Float, dr.width(h)) for _ in optics.constituents]
-    _, totals = dr.while_loop((t.UInt(0), zero), lambda i, _: i < last, add, max_iterations=-1, label="column_up")
+    _, totals = sum_loop((t.UInt(0), zero), lambda i, _: i < last, add, optics.profiles, "column_up")
     return totals

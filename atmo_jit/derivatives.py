@@ -164,7 +164,7 @@ class Linearization:
         # While the kernels run.
         steps = {name: self._steps(name) for name in names if name not in RADII and name not in VIEWS}
         found = {name: adjoints[1][name].numpy() for name in of_views}
-        host = [{group: [leaf.numpy() for leaf in flat(part[group])] for group in part} for part in adjoints[0]]
+        host = [_leaves(*both) for both in zip(self._numbers, adjoints[0], strict=False)]
         for name in names:
             if name in RADII:
                 change = self._by_radius(name)
@@ -173,36 +173,34 @@ class Linearization:
                 found[name] = self._pulled_back(name, steps[name], host)
         return found
 
-    def _steps(self, name: str) -> list[dict[str, Any]]:
-        """How the values of every band change with a parameter.
+    def _steps(self, name: str) -> list[list[Any]]:
+        """How the numbers of every band change with a parameter, as lists of leaves.
 
-        Channels do not mix between a parameter and the values, nor do nodes of a profile: one step of all of them
+        Channels do not mix between a parameter and the numbers, nor do nodes of a profile: one step of all of them
         serves each.
         """
         along = np.ones_like(described(self.atmosphere, name))
-        return [
-            like(numbers, tangent(optics, name, along, self._degrees, self._phase_degree))
-            for optics, numbers in zip(self._optics, self._numbers, strict=True)
-        ]
+        return [tangent(optics, name, along, self._degrees, self._phase_degree) for optics in self._optics]
 
-    def _pulled_back(
-        self, name: str, of_bands: list[dict[str, Any]], adjoints: list[dict[str, list[np.ndarray]]]
-    ) -> np.ndarray:
-        """Derivative by a parameter, from how the values of every band change with it and the derivatives by those."""
-        value, nodes = described(self.atmosphere, name), ".profile." in name
+    def _pulled_back(self, name: str, of_bands: list[list[Any]], adjoints: list[list[Any]]) -> np.ndarray:
+        """Derivative by a parameter, from how the numbers of every band change with it and the derivatives by those."""
+        value = described(self.atmosphere, name)
+        nodes, each = ".profile." in name, per_wavelength(self.atmosphere, name)
         found = np.zeros(np.shape(value))
-        for optics, steps, adjoint in zip(self._optics, of_bands, adjoints, strict=True):
-            for group in self._groups(name):
-                along = flat(steps[group])
-                parts = [grad.reshape(len(d), -1)[:, : d.shape[1]] if d.ndim == 2 else grad.reshape(d.shape)
-                    for grad, d in zip(adjoint[group], along, strict=True)]
-                products = [a * b for a, b in zip(parts, along, strict=True)]
+        for optics, channels, steps, adjoint in zip(self._optics, self._channels, of_bands, adjoints, strict=True):
+            for channel, step, grad in zip(channels, steps, adjoint, strict=True):
+                if grad is None or not np.any(step):
+                    continue
+                # Rows of a table may be longer on the device.
+                product = step * (grad.reshape(len(step), -1)[:, : step.shape[1]] if np.ndim(step) == 2 else grad)
                 if nodes:
-                    found += sum(p for p, d in zip(products, along, strict=True) if np.any(d))
-                elif per_wavelength(self.atmosphere, name):
-                    found[optics.indices] += optics.by_channel(like(steps[group], products))
-                else:
-                    found += sum(np.sum(p) for p in products)
+                    found += product
+                elif not each:
+                    found += np.sum(product)
+                elif channel is not None:
+                    found[optics.indices[channel]] += product[0]
+                elif product.ndim == 2:
+                    found[optics.indices] += product.sum(axis=0).reshape(-1, optics.channel_count).sum(axis=0)
         return found
 
     def _groups(self, name: str) -> tuple[str, ...]:
@@ -260,6 +258,10 @@ class Linearization:
     @cached_property
     def _numbers(self) -> list[dict[str, Any]]:
         return [optics.numbers(optics.atmosphere, self._degrees, self._phase_degree) for optics in self._optics]
+
+    @cached_property
+    def _channels(self) -> list[list[int | None]]:
+        return [optics.channels(numbers) for optics, numbers in zip(self._optics, self._numbers, strict=True)]
 
     @cached_property
     def _made(self) -> list[dict[str, Any]]:
@@ -341,6 +343,15 @@ class Linearization:
         outputs, changes = evaluation.forward(self._made, *arguments, values, views)
         self.__dict__.setdefault("value", self._arrays(outputs))
         return self._arrays(changes)
+
+
+def _leaves(numbers: dict[str, Any], adjoint: dict[str, Any]) -> list[Any]:
+    """Derivatives by all ``numbers`` of a band, given those by some groups of them; None: there is none."""
+    found: list[Any] = []
+    for group, part in numbers.items():
+        leaves = flat(adjoint.get(group, part))
+        found += [leaf.numpy() for leaf in leaves] if group in adjoint else [None] * len(leaves)
+    return found
 
 
 def linearize(atmosphere: Any, views: Mapping[str, Any], **options: Any) -> Linearization:

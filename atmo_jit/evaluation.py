@@ -74,12 +74,12 @@ class Evaluation:
             orders = self._orders(values, solved, tables)
             return _pulled_back([v for band in orders for v in (band["first"], *band["later"])], weights, wanted)
 
-        def of_columns(values: Any, weights: Any) -> Any:
+        def of_columns(values: Any, known: Any, weights: Any) -> Any:
             """Derivatives by values, of the columns."""
             values = copied(values)
             wanted = _named(values, of_values)
             dr.enable_grad(wanted)
-            return _pulled_back(self._sky.columns_again(values), weights, wanted)
+            return _pulled_back(self._sky.columns_again(values, known), weights, wanted)
 
         # Several recordings: what one needs in between is free when it has been played.
         small = [{**band, "known": None, "orders": _orders_of(band["known"])} for band in solved]
@@ -90,7 +90,9 @@ class Evaluation:
             more, again = self._run(("orders", *of_values), of_orders, values, solved, lights)
             found = _sum(found, more)
             if by_columns:
-                found = _sum(found, self._run(("columns", *of_values), of_columns, values, _sum(tables, again)))
+                known = [band["columns"] for band in solved]
+                weights = _sum(tables, again)
+                found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, weights))
         return found, by_views
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -111,7 +113,7 @@ class Evaluation:
         return self._sky.orders_again(values, shares, columns, known)
 
     def _again(self, values: list[Any], solved: list[Any]) -> Sky:
-        columns = self._sky.columns_again(values)
+        columns = self._sky.columns_again(values, [band["columns"] for band in solved])
         shares = [band["shares"] for band in solved]
         return self._sky.again(values, shares, columns, self._orders(values, solved, columns))
 
@@ -175,7 +177,7 @@ def _sum(tree: Any, other: Any) -> Any:
 
 
 def _orders_of(known: dict[str, Any]) -> dict[str, Any]:
-    return {name: known[name] for name in ("reference", "first", "later")}
+    return {name: known[name] for name in ("reference", "first", "later", "finishing")}
 
 
 def _pulled_back(outputs: list[Any], weights: list[Any], wanted: Any) -> Any:

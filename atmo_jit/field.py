@@ -30,8 +30,9 @@ class Field:
 
     ``moments`` [K, suns, pairs(degree), channels] of light that scatters once more, ``sky`` and ``reflected`` [K, suns,
     channels]: irradiance by all that arrives, and by what may be reflected, over the scattering depth of the air above.
-    ``scatters``: whether any of it scatters once more. ``shares``: what each order above the first counts in them;
-    ``known``: what multiple_scattering.orders_again need not compute once more, where that was asked for.
+    ``scatters``: whether any of it scatters once more. ``shares``: what each order above the first counts in them, the
+    last with what remainder.Remainder holds where it stands for all that follow; ``known``: what
+    multiple_scattering.orders_again need not compute once more, where that was asked for.
     """
 
     shares: list[Any]

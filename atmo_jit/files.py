@@ -57,7 +57,7 @@ def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
         raise InputError(f"output {shown(str(path), 200)}: the name must end in {suffix}")
     try:
         target = path.resolve()
-        exists = target.exists()
+        exists = _exists(target)
         folder_exists = target.parent.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long a name, a null character, a loop of links
         raise InputError(f"output {shown(str(path), 200)}: {_reason(error)}") from None
@@ -73,12 +73,21 @@ def check_output(path: str | os.PathLike[str], suffix: str) -> Path:
     return target
 
 
+def _exists(path: Path) -> bool:
+    """Whether there is something; raises what Path.exists hides from Python 3.14 on: names too long, loops of links."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def check_folder(path: str | os.PathLike[str]) -> Path:
     """``path`` as the name of a folder that can be written to, or made. Raises InputError otherwise."""
     path = Path(path)
     try:
         nearest = path.resolve()
-        while not nearest.exists():
+        while not _exists(nearest):
             nearest = nearest.parent
         is_folder = nearest.is_dir()
     except (OSError, ValueError, RuntimeError) as error:

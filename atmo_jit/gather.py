@@ -12,6 +12,7 @@ moments of a higher m than the result keeps are left out, of whatever degree the
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -83,7 +84,7 @@ class Gather:
         held: dict[str, Any] | None = None,
     ) -> None:
         self.optics, self.grid, self.reference = optics, grid, reference
-        self.azimuths, self.most = azimuths, most
+        self.azimuths, self.most, self.cuts = azimuths, most, True
         key = ("samples", directions, azimuths)
         self.samples = grid.kept(key, lambda: Samples(grid, directions, azimuths))
         self.paths = self.samples.paths
@@ -92,6 +93,14 @@ class Gather:
             scale = self._reference_at_samples()
             held = {"scattered": weights.scattered, "reflected": weights.reflected, "scale": scale}
         self.held = held
+
+    def signed(self, reference: Any, scale: Any = None) -> Gather:
+        """The same step, linear, for light that may be below 0, over another reference; ``scale``: that at the
+        samples."""
+        other = copy(self)
+        other.reference, other.cuts = reference, False
+        other.held = {**self.held, "scale": other._reference_at_samples() if scale is None else scale}
+        return other
 
     def _reference_at_samples(self) -> Any:
         """The reference at every sample, [visits, S, azimuths, 4]."""
@@ -104,11 +113,16 @@ class Gather:
 
     def __call__(self, light: Moments) -> Any:
         """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
+        return self.along(light, self.weights(light.degree, min(light.most, self.most) + 1))
+
+    def weights(self, degree: int, orders: int) -> Any:
+        """What moments up to ``degree``, of as many azimuthal ``orders``, count along the paths (weight_rows)."""
+        return weight_rows(self.optics, self.paths, self.held["scattered"], self.held["reflected"], degree, orders)
+
+    def along(self, light: Moments, weights: Any) -> Any:
+        """The same, with ``weights`` made before."""
         channels, suns = self.optics.channel_count, self.grid.shape[1]
         orders = min(light.most, self.most) + 1
-        weights = weight_rows(
-            self.optics, self.paths, self.held["scattered"], self.held["reflected"], light.degree, orders
-        )
         table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
         return self._harmonics(interpolated(self.samples, self.held["scale"], table, orders, channels))
 
@@ -122,7 +136,7 @@ class Gather:
         def add(j: Any, sums: list[Any], means: list[Any]) -> tuple[Any, ...]:
             values = packet(radiance, node * azimuths + j, 4)[:channels]
             means = [v + mean for v, mean in zip(values, means, strict=True)]
-            values = [dr.maximum(v, 0.0) for v in values]
+            values = [dr.maximum(v, 0.0) for v in values] if self.cuts else values
             return j + 1, add_harmonics(sums, values, dr.gather(t.Float, cosines, j)), means
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range((self.most + 2) * channels)]
@@ -131,7 +145,7 @@ class Gather:
         _, sums, means = dr.while_loop(state, lambda j, *_: j < end, add, max_iterations=-1, label="azimuths")
         # A few azimuthal harmonics swing below 0 beside a forward peak. Left there they may grow from order to order;
         # cut off they add light: so what is left is made as much as there was.
-        for c in range(channels):
+        for c in range(channels) if self.cuts else ():
             lit = sums[c] > FAINT
             share = dr.select(lit, dr.maximum(means[c], 0.0) / dr.select(lit, sums[c], 1.0), 1.0)
             sums[c::channels] = [share * value for value in sums[c::channels]]

@@ -25,6 +25,7 @@ _PLANET = ("bottom_radius_m", "top_radius_m", "sun_angular_radius_deg")
 NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
+_DEEP_SHARES = 0.5, 2.0  # of bottom and top in deep air, whose light all comes through its top
 _TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 
 
@@ -78,10 +79,11 @@ class Grid(Keeper):
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
         self._kept: dict[Any, Any] = {}
-        self._place_altitudes(atmosphere, resolution.altitudes, resolution.refine)
+        self._place_altitudes(atmosphere, resolution)
         self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
 
-    def _place_altitudes(self, atmosphere: Atmosphere, count: int, refine: int) -> None:
+    def _place_altitudes(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
+        count, refine = resolution.altitudes, resolution.refine
         # Samples dense near the ground, so that a thin layer there is resolved too.
         h = atmosphere.thickness_m * (np.arange(_FINE + 1) / _FINE) ** 2
         middle, step = 0.5 * (h[1:] + h[:-1]), np.diff(h)
@@ -101,7 +103,9 @@ class Grid(Keeper):
                 rise = rise + share / share.sum()
         # Light in a thick layer changes within a free path of its top and bottom, slowly between.
         below = np.cumsum(depth) - 0.5 * depth
-        rise = rise + depth / (1.0 + below) + depth / (1.0 + depth.sum() - below)
+        above = depth.sum() - below
+        low, high = _DEEP_SHARES if resolution.deep else (1.0, 1.0)
+        rise = rise + low * depth / (1.0 + below) + high * depth / (1.0 + above)
         u = np.concatenate([[0.0], np.cumsum(rise)])
         self._u, self._h_of_u = u * ((count - 1) / u[-1]), h
         self.h = self.levels_at(1)

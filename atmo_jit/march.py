@@ -31,7 +31,8 @@ SPENT_DEPTH = 20.0  # what lies behind 2e-9 of transmittance is not seen
 
 @dataclass
 class Rays:
-    """Rays that start inside the atmosphere, with the sun's place; every member a Float or Bool array of one width.
+    """Rays that start inside the atmosphere, with the sun's place; every member a Float or Bool array of one width, or
+    Float64 for the march of Optics.exact.
 
     ``h`` altitude (m) of the origin; ``mu``, ``mu_s``, ``nu``: cosines of view zenith, sun zenith (at the origin) and
     their angle; ``stop`` distance (m) to the end; ``ground``: the ray ends on the ground.
@@ -43,6 +44,11 @@ class Rays:
     nu: Any
     stop: Any
     ground: Any
+
+    def single(self) -> Rays:
+        """The same in single precision."""
+        kind = types().Float
+        return Rays(*(kind(v) for v in (self.h, self.mu, self.mu_s, self.nu, self.stop)), self.ground)
 
 
 @dataclass
@@ -63,16 +69,16 @@ class Source(Protocol):
 
 
 def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
-    """Rays from ``h`` to whatever they meet first, the ground or the top.
+    """Rays from ``h`` to whatever they meet first, the ground or the top, in the precision of ``h``.
 
-    That is decided in the precision of ``h``: in single precision a ray 1e-7 rad off the horizon may be taken for one
+    That is decided in it too: in single precision a ray 1e-7 rad off the horizon may be taken for one
     on its other side, which sees other light.
     """
     t, wide = types(), type(h)
     radius = wide(optics.radius)
     ground = hits_ground(radius, h, mu)
     stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, wide(optics.thickness)))
-    return Rays(*(t.Float(v) for v in (h, mu, mu_s, nu, stop)), t.Bool(ground))
+    return Rays(h, mu, mu_s, nu, stop, t.Bool(ground))
 
 
 def visible_sun(optics: Optics, h: Any, r: Any, mu_s: Any) -> Any:
@@ -137,7 +143,7 @@ class Shells:
     """
 
     def __init__(self, optics: Optics, largest: Any = None) -> None:
-        self.breaks = floats(optics.breaks_m)
+        self.breaks = optics.altitudes(optics.breaks_m)
         self.last = parameter(len(optics.breaks_m) - 2.0)
         self._densest = _largest_extinctions(optics, self.breaks) if largest is None else floats(largest)
         self._each = largest is None
@@ -207,7 +213,7 @@ class Cuts:
         shell after it."""
         t, rays, radius, breaks = types(), self._rays, self._optics.radius, self._breaks
         falling = self._r_mu + d < 0.0
-        target = dr.gather(t.Float, breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
+        target = dr.gather(type(breaks), breaks, t.UInt(dr.select(falling, shell, shell + 1.0)))
         bottoms_out = falling & (target <= self._perigee)
         crossing = dr.select(
             bottoms_out,
@@ -250,9 +256,10 @@ def march(
     Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's
     shadow. ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the
     centroid of the piece's weight, which is exact for a field that is linear there. ``shells``: those of these
-    optics, where they cannot be made because a kernel is being traced.
+    optics, where they cannot be made because a kernel is being traced. Where rays are and where they are cut is
+    computed in the precision of the rays and of the optics (Optics.exact).
     """
-    t = types()
+    t, wide = types(), type(rays.h)
     c_count, k_count = optics.channel_count, len(optics.constituents)
     width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
     if k_count == 0:
@@ -261,11 +268,11 @@ def march(
     shells = shells or Shells(optics)
     cuts, r_mu = Cuts(optics, rays, sunlit=single, shells=shells), (optics.radius + rays.h) * rays.mu
     rule = shells.rule(nodes)
-    phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
+    phases = {k: optics.phase_values(k, t.Float(rays.nu)) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
         end, shell = cuts.after(d, shell, amounts)
-        length = end - d
+        length = t.Float(end - d)
 
         density = [
             optics.densities(altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, x, d))[0])
@@ -275,12 +282,11 @@ def march(
         def node(g: Any, one: list[Any], weight: list[Any], centroid: Any, total: Any) -> tuple[Any, ...]:
             x, w, *running = rule.at(g)
             h, r, mu_s = point_along(optics, rays, dr.fma(length, x, d))
+            here, fraction = optics.densities(h), t.Float(visible_sun(optics, h, r, mu_s))
             inside = [dr.fma(length, rule.sum(running, density, k), amounts[k]) for k in range(k_count)]
             seen = [dr.exp(-depth) * (length * w) for depth in optics.optical_depths(inside)]
-            here = optics.densities(h)
             if single:
-                sun_depths = optics.optical_depths(columns.toward(h, mu_s))
-                fraction = visible_sun(optics, h, r, mu_s)
+                sun_depths = optics.optical_depths(columns.toward(t.Float(h), t.Float(mu_s)))
                 lit = [s * dr.exp(-depth) * fraction for s, depth in zip(seen, sun_depths, strict=True)]
                 for k in optics.scatterers:
                     for c in range(c_count):
@@ -294,7 +300,7 @@ def march(
                         centroid = dr.fma(share, x, centroid)
             return g + 1, one, weight, centroid, total
 
-        zero = d * 0.0
+        zero = length * 0.0
         weight = [zero + 0.0 for _ in range(len(optics.scatterers) * c_count if source is not None else 0)]
         state = (t.UInt(0), one, weight, zero + 0.0, zero + 0.0)
         _, one, weight, centroid, total = dr.while_loop(state, lambda g, *_: g < rule.count, node, label="nodes")
@@ -302,7 +308,10 @@ def march(
             at = dr.fma(length, dr.select(total > 0.0, centroid / total, 0.5), d)
             h, r, mu_s = point_along(optics, rays, at)
             mu = dr.clip((r_mu + at) / r, -UPRIGHT, UPRIGHT)
-            toward = source.scattered(h, mu_s, mu, relative_azimuth(mu, mu_s, rays.nu), total > 0.0)
+            h, mu_s, mu = (t.Float(v) for v in (h, mu_s, mu))
+            # Of these cosines: light is linear in sin * cos(azimuth) beside the zenith, however they are rounded.
+            cos_phi = t.Float(relative_azimuth(wide(mu), wide(mu_s), rays.nu))
+            toward = source.scattered(h, mu_s, mu, cos_phi, total > 0.0)
             for n in range(len(optics.scatterers)):
                 for c in range(c_count):
                     more[c] = dr.fma(weight[n * c_count + c], toward[n][c], more[c])
@@ -312,7 +321,7 @@ def march(
         return end, shell, amounts, one, more
 
     state = (
-        dr.zeros(t.Float, width),
+        dr.zeros(type(rays.h), width),
         cuts.first_shell(),
         [dr.zeros(t.Float, width) for _ in range(k_count)],
         [dr.zeros(t.Float, width) for _ in range(c_count)],
@@ -352,7 +361,7 @@ def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
     falling = rays.mu < 0.0
 
     def below(i: Any) -> Any:
-        level = dr.gather(t.Float, breaks, i)
+        level = dr.gather(type(breaks), breaks, i)
         return (level < rays.h) | (~falling & (level <= rays.h))
 
     index = dr.binary_search(0, count - 1, below)
@@ -365,6 +374,8 @@ def _largest_extinctions(optics: Optics, breaks: Any) -> Any:
     t = types()
     lower = dr.arange(t.UInt, len(optics.breaks_m) - 1)
     # A step in a tabulated profile sits on a break, and the density there is the upper side's.
-    ends = dr.gather(t.Float, breaks, lower), dr.gather(t.Float, breaks, lower + 1) * (1.0 - 1e-6)
-    low, high = (optics.extinctions(optics.densities(h)) for h in ends)
+    ends = (dr.gather(type(breaks), breaks, i) for i in (lower, lower + 1))
+    low, high = (
+        optics.extinctions(optics.densities(h * side)) for h, side in zip(ends, (1.0, 1.0 - 1e-6), strict=True)
+    )
     return table_of([dr.maximum(a, b) for a, b in zip(low, high, strict=True)], lower)

@@ -25,13 +25,15 @@ from .paths import directions_at
 from .projection import Moments, Projection
 from .recording import Recordings
 from .refinement import Reference
+from .remainder import Remainder, found, parted
 from .resolution import Resolution
 from .single_scattering import first_order
 from .total import following, total_of
 
 LEAST = 1e-6  # of the light: an order that is less says nothing of those that follow
-STEADY = 40  # orders after which no light grows: what does is rounding, and is left out
 AT_ONCE = 4  # orders computed before the sum is first extrapolated
+FEW, LACKING = 16, 0.03  # orders after which so much of the light must not lack, if a few more are to do
+REST = 0.1  # of what a sum of orders may lack, that the remainder may: another turn costs little
 
 
 def solve(
@@ -48,7 +50,8 @@ def solve(
     observer.
 
     ``orders``: scattering and reflection events in the final picture; None: all of them, summed by extrapolation as
-    soon as that is steady to ``tolerance``. The field's sky irradiance counts one event more than its moments.
+    soon as that is steady to ``tolerance``; where that is not soon, those that follow are solved for at once
+    (remainder.found). The field's sky irradiance counts one event more than its moments.
     ``noting``: the field gets what ``solve_again`` need not compute once more, Field.known.
     """
     steps = _Steps.of(optics, columns, grid, resolution)
@@ -58,17 +61,16 @@ def solve(
     later, tables = done["later"], [done["tables"]]
     probes = [steps.probe(light, done, n) for n, light in enumerate(later, 2)]
     weights = arriving = np.zeros((0, grid.shape[1], optics.channel_count))
+    tail = rest = None
     for n in range(AT_ONCE, most + 1):
         if orders is None and later:
-            new, error = _extrapolated(np.stack(probes))
-            if n > STEADY and not np.isfinite(error):
-                later.pop()
-                tables.pop()
-                break
-            weights = arriving = new
+            weights, error = _extrapolated(np.stack(probes))
+            arriving = weights
             if error < resolution.converged * tolerance:
                 break
-        if n == most:
+        if n == most or (orders is None and n >= FEW and error > LACKING):
+            if orders is None and later:
+                tail, rest = steps.remainder(values, done, later[-1], n, REST * resolution.converged * tolerance)
             break
         later.append(steps.step(values, done, later[-1], n + 1, noting=noting))
         tables.append(done["tables"])
@@ -77,22 +79,37 @@ def solve(
         arriving = np.ones((len(later), grid.shape[1], optics.channel_count))
         weights = arriving.copy()
         weights[-1] = 0.0
-    shares = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
-    parts = steps.finish(values, done, later, shares)
+    shares: list[Any] = [[floats(w), floats(a)] for w, a in zip(weights, arriving, strict=True)]
+    if tail is not None:
+        later.append(rest)
+        shares = [[floats(np.ones_like(w)), floats(np.ones_like(w))] for w in [*weights, weights[0]]]
+    extrapolated = noting and orders is None and tail is None
+    parts, finishing = steps.finish(values, done, later, shares, noting=noting, extrapolated=extrapolated)
+    if tail is not None:
+        shares[-1] = {**tail, "shares": shares[-1]}
     field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
     if noting:
         field.known = {"reference": done["reference"], "first": done["first"], "later": later}
         field.known["tables"] = [table for some in tables for table in some]
+        field.known["finishing"] = finishing
     return field
 
 
 def orders_again(
-    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, count: int, known: dict[str, Any] | None
+    optics: Optics,
+    columns: SunColumns,
+    grid: Grid,
+    resolution: Resolution,
+    shares: list[Any],
+    known: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The light of ``count`` orders, as solve_again takes it, for values of the optics that carry derivatives.
-    ``known``: what a solve for these very values found (Field.known). Nothing in here waits for a result."""
+    """The light of the orders that ``shares`` count, as solve_again takes it, for values of the optics that carry
+    derivatives. ``known``: what a solve for these very values found (Field.known). Nothing in here waits for a
+    result."""
     steps = _Steps(optics, columns, grid, resolution)
-    return steps.started(optics.values(resolution.degrees, resolution.phase_degree), count, known)
+    values = optics.values(resolution.degrees, resolution.phase_degree)
+    started = steps.started(values, len(shares) + 1, known, parted(shares)[1])
+    return {**started, "finishing": known["finishing"]} if known else started
 
 
 def solve_again(
@@ -109,9 +126,11 @@ def solve_again(
     values = optics.values(resolution.degrees, resolution.phase_degree)
     optics = optics.with_values(values)
     steps = _Steps(optics, columns, grid, resolution)
-    parts = steps.finished(
-        values, done["reference"], done["first"], done["later"], shares, extrapolated=orders is None
-    )
+    counts, tail = parted(shares)
+    extrapolated = orders is None and tail is None
+    of_orders = (done[name] for name in ("reference", "first", "later"))
+    known = done.get("finishing")
+    parts = steps.finished(values, *of_orders, counts, extrapolated=extrapolated, known=known)
     return _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
 
 
@@ -201,6 +220,14 @@ class _Steps:
         )
         return light
 
+    def remainder(
+        self, values: Any, done: dict[str, Any], light: Any, n: int, tolerance: float
+    ) -> tuple[dict[str, Any], Any]:
+        """All orders after order ``n``, and what remainder.Remainder holds for them."""
+        reference = Reference.of(self._grid, self._optics.channel_count, done["reference"])
+        gather = self._gather(self._optics.with_values(values), reference, n + 1, done["gather"])
+        return found(gather, self._project(n + 1), light, tolerance, self._run)
+
     def probe(self, light: Any, done: dict[str, Any], n: int) -> np.ndarray:
         """The moments of order ``n`` of degrees 0 and 1 with m = 0, [K, S, 2, channels], over the reference where that
         is brightest under the same sun.
@@ -214,17 +241,26 @@ class _Steps:
         light = Moments(light, *self._degree(n), suns, channels)
         return np.swapaxes(light.numpy()[:, :2, :suns] * inverse, 1, 2)
 
-    def finish(self, values: Any, done: dict[str, Any], later: list[Any], shares: list[Any]) -> tuple[Any, ...]:
-        """What Field holds: moments, sky and reflected irradiance."""
-        return self._run(
-            ("finish", len(later)),
-            lambda v, reference, first, later, shares: self.finished(v, reference, first, later, shares),
-            values,
-            done["reference"],
-            done["first"],
-            later,
-            shares,
-        )
+    def finish(
+        self,
+        values: Any,
+        done: dict[str, Any],
+        later: list[Any],
+        shares: list[Any],
+        *,
+        noting: bool,
+        extrapolated: bool,
+    ) -> tuple[Any, ...]:
+        """What Field holds: moments, sky and reflected irradiance; and all tables if they are noted. ``extrapolated``:
+        with shares that carry derivatives (total.following)."""
+
+        def finish(*arguments: Any) -> tuple[Any, ...]:
+            with noted.noting() as tables:
+                parts = self.finished(*arguments, extrapolated=extrapolated)
+            return parts, tables if noting else []
+
+        key = "finish", len(later), noting, extrapolated
+        return self._run(key, finish, values, done["reference"], done["first"], later, shares)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         if _always_traced or self._optics.profiles_differentiable or dr.grad_enabled(arguments):
@@ -239,14 +275,18 @@ class _Steps:
         r = self._resolution
         return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
 
-    def started(self, values: Any, count: int, known: dict[str, Any] | None = None) -> dict[str, Any]:
-        """The same, traced."""
+    def started(
+        self, values: Any, count: int, known: dict[str, Any] | None = None, tail: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """The same, traced; with a ``tail``, what Remainder holds, the last of the ``count`` is all that follow."""
         if known is None:
-            return self._started(values, count, None)
+            return self._started(values, count, None, tail, None)
         with noted.knowing(known["tables"]):
-            return self._started(values, count, known["reference"])
+            return self._started(values, count, known["reference"], tail, tail and known["later"][-1])
 
-    def _started(self, values: Any, count: int, held: dict[str, Any] | None) -> dict[str, Any]:
+    def _started(
+        self, values: Any, count: int, held: dict[str, Any] | None, tail: dict[str, Any] | None, rest: Any
+    ) -> dict[str, Any]:
         optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
         suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
         project = Projection.at(grid, fine, *self._degree(1))
@@ -254,12 +294,15 @@ class _Steps:
         with noted.apart():
             reference = Reference.above(grid, first) if held is None else Reference.of(grid, first.channels, held)
         later, light, gather = [], first, None
-        for n in range(2, count + 1):
+        for n in range(2, count + (tail is None)):
             if n > 2 and self._stage(n) != self._stage(n - 1):
                 gather = None
             gather = gather or self._gather(optics, reference, n, None)
             light = self._next(gather, light, n)
             later.append(light.values)
+        if tail is not None:
+            with noted.apart():
+                later.append(Remainder(gather, self._project(count), tail).after(light.values, rest))
         held = gather and gather.held
         return {"first": first.values, "reference": reference.held, "later": later, "gather": held}
 
@@ -277,8 +320,10 @@ class _Steps:
         return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.most, r.nodes, held)
 
     def _next(self, gather: Gather, light: Moments, n: int) -> Moments:
-        project = Projection.at(self._grid, self._stages[self._stage(n)], *self._degree(n))
-        return project(gather(light), self._grid.shape[1], light.channels)
+        return self._project(n)(gather(light), self._grid.shape[1], light.channels)
+
+    def _project(self, n: int) -> Projection:
+        return Projection.at(self._grid, self._stages[self._stage(n)], *self._degree(n))
 
     def finished(
         self,
@@ -288,9 +333,13 @@ class _Steps:
         later: list[Any],
         shares: list[Any],
         *,
-        extrapolated: bool = False,
+        extrapolated: bool,
+        known: list[Any] | None = None,
     ) -> tuple[Any, ...]:
         """The same, traced."""
+        if known is not None:
+            with noted.knowing(known):
+                return self.finished(values, reference, first, later, shares, extrapolated=extrapolated)
         optics, grid = self._optics.with_values(values), self._grid
         channels = optics.channel_count
         reference = Reference.of(grid, channels, reference)

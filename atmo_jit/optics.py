@@ -17,7 +17,7 @@ import numpy as np
 
 from ._trees import flat, like
 from .atmosphere import Atmosphere
-from .backend import floats, parameter, spread, table
+from .backend import doubles, floats, parameter, spread, table, types
 from .phase import CornetteShanks, HenyeyGreenstein, RayleighPhase
 from .profile import Exponential, Tabulated, Tent
 from .resolution import moments_of
@@ -31,6 +31,8 @@ LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
 FURTHER, THIN = 4.0, 0.05
 RAMP, THICK = 0.25, 4.0
 STEEPER = 4.0
+# Altitudes in single precision are rounded by ROUNDING of themselves; an error of UNSEEN of an optical depth is small.
+ROUNDING, UNSEEN, SELDOM = 6e-8, 1e-5, 0.01
 FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
 _VALUES = (
     "radius",
@@ -64,6 +66,7 @@ class Optics:
     extinction: list[list[Any]]
     profiles: list[list[Any]]
     asymmetry: list[list[Any]]
+    _is_exact = False
 
     def __init__(
         self, atmosphere: Atmosphere, indices: np.ndarray, scattering_too: Collection[str] = ()
@@ -119,12 +122,19 @@ class Optics:
             made["moment_tables"] = {degree: self.scatterers_moments(degree, atmosphere) for degree in degrees}
         return made
 
-    def by_channel(self, part: Any) -> np.ndarray:
-        """Sums over one entry of ``numbers``, of what belongs to each channel."""
-        if isinstance(part, dict):
-            return sum(table.sum(axis=0).reshape(-1, self.channel_count).sum(axis=0) for table in part.values())
-        rows = part if part and isinstance(part[0], list) else [part]
-        return sum((np.array(row) for row in rows if len(row) == self.channel_count), np.zeros(self.channel_count))
+    def channels(self, numbers: dict[str, Any]) -> list[int | None]:
+        """Which channel each leaf of ``numbers`` belongs to; None: to none, or to all, as a table does."""
+
+        def of(part: Any) -> list[int | None]:
+            if isinstance(part, dict):
+                return [channel for inner in part.values() for channel in of(inner)]
+            if not isinstance(part, list):
+                return [None]
+            if part and isinstance(part[0], list):
+                return [channel for inner in part for channel in of(inner)]
+            return list(range(len(part))) if len(part) == self.channel_count else [None] * len(part)
+
+        return of(numbers)
 
     def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
         """Everything that kernels read of an atmosphere, with phase moments up to ``degrees``."""
@@ -137,8 +147,42 @@ class Optics:
     def with_values(self, values: dict[str, Any]) -> Optics:
         """These optics with other ``values``."""
         other = copy(self)
-        vars(other).update(values)
+        vars(other).update(values, exact=None)
         return other
+
+    @cached_property
+    def exact(self) -> Optics | None:
+        """These optics with altitudes in double precision, for rays that are too (a tenth slower); None where the
+        rounding of altitudes in single precision is not seen."""
+        if max((self._rounded(c) for c in self.constituents), default=0.0) < UNSEEN:
+            return None
+        t, air = types().Float64, self.atmosphere
+        other = self.with_values({})
+        other._is_exact = True
+        other.radius, other.thickness = (dr.opaque(t, v, 1) for v in (air.bottom_radius_m, air.thickness_m))
+        other.profiles = [
+            [doubles(v) if isinstance(v, np.ndarray) else dr.opaque(t, v, 1) for v in _numbers_of(c.profile)]
+            for c in self.constituents
+        ]
+        return other
+
+    def _rounded(self, c: Any) -> float:
+        """What rounding of altitudes does to optical depths of one constituent: the error of a vertical ray's from
+        beside a corner, and a part of that of a horizontal ray's from beside a step, which few see; the relative error
+        where it is exponential."""
+        top, radius = self.atmosphere.thickness_m, self.atmosphere.bottom_radius_m
+        corners = np.clip([*c.profile.kinks_m, top], 0.0, top)
+        below, above = (c.profile.density(corners * (1.0 + side)) for side in (-1e-9, 1e-9))
+        above = np.where(corners < top, above, 0.0)
+        moved = ROUNDING * corners
+        depths = moved * np.maximum(below, above)
+        depths += SELDOM * np.abs(above - below) * np.sqrt(8.0 * (radius + corners) * moved)
+        relative = ROUNDING * top / c.profile.scale_height_m if isinstance(c.profile, Exponential) else 0.0
+        return max(relative, float(np.max(c.extinction_per_m) * np.max(depths)))
+
+    def altitudes(self, values: np.ndarray) -> Any:
+        """Altitudes (m) on the device, in the precision of these optics."""
+        return doubles(values) if self._is_exact else floats(values)
 
     def spread(self, width: int) -> Optics:
         """These optics for a kernel of ``width`` lanes: derivatives by all values are summed over the lanes together
@@ -158,9 +202,10 @@ class Optics:
 
     def densities(self, h: Any) -> list[Any]:
         """Relative density of every constituent at altitude ``h`` (m)."""
-        return [
+        found = [
             type(c.profile)(*numbers).density(h) for c, numbers in zip(self.constituents, self.profiles, strict=True)
         ]
+        return [types().Float(density) for density in found] if self._is_exact else found
 
     def extinctions(self, densities: list[Any]) -> list[Any]:
         """Extinction coefficient (1/m) per channel."""

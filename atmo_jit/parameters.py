@@ -82,7 +82,7 @@ def moved(atmosphere: Atmosphere, name: str, direction: float | np.ndarray) -> t
 def tangent(
     optics: Optics, name: str, direction: float | np.ndarray, degrees: tuple[int, ...], phase_degree: int
 ) -> list[np.ndarray]:
-    """Derivative of Optics.numbers along ``direction`` of a parameter, as a list of leaves.
+    """Derivative of Optics.numbers along ``direction`` of a parameter, as a list of leaves, numbers and arrays.
 
     Where the list cannot be moved as a whole, one of its numbers being at the lower end of its range and another at the
     upper, each is moved by itself; one that can be moved neither way, a corner of a step on the ground, has none.
@@ -96,7 +96,7 @@ def tangent(
             return [sum(leaves) for leaves in zip(*parts, strict=True)]
         apart = 1.0  # between two atmospheres that are the same
     low, high = (flat(optics.numbers(air, degrees, phase_degree)) for air in (before, after))
-    return [(np.asarray(b, float) - np.asarray(a, float)) / apart for a, b in zip(low, high, strict=True)]
+    return [(b - a) / apart for a, b in zip(low, high, strict=True)]
 
 
 def replaced(

@@ -89,6 +89,11 @@ class Projection:
         self._m = uints(np.append(m, 0))
         self.entries = count + 1
 
+    def upright(self) -> np.ndarray:
+        """Weights of the directions for the pairs with m = 0 and the irradiance, float64 [K, degree + 2, D]."""
+        weights = self._basis.numpy().reshape(self.altitudes, self.entries, self.count)
+        return weights[:, [*range(self.degree + 1), self.entries - 1]].astype(float)
+
     @classmethod
     def at(cls, grid: Grid, directions: Directions, degree: int, most: int) -> Projection:
         """The projection for a grid, kept with it."""

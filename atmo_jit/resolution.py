@@ -14,12 +14,15 @@ import numpy as np
 from .atmosphere import Atmosphere, Constituent
 
 CLOUD = 3.0  # optical depth
-MOST_ALTITUDES = 48
+DEEP = 8.0  # of what scatters nearly all light: there are
+MOST_ALTITUDES, DEEP_ALTITUDES = 48, 64
+THICK_DEGREE, DEEP_DEGREE = 16, 24  # of order 1
 MANY = 20  # events; light that has as many is lost by what each order lacks
 # Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
-FINE_DEGREES, FINE_ALTITUDES = 4, 4  # more for derivatives that are to be as exact as the light
+# More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
+FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 4, 1.3, 8, 12
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -46,8 +49,9 @@ class Resolution:
     their paths. ``first_*``: the same for order 1, whose forward peak is sharper; ``phase_degree``: that of the phase
     functions there; ``beam_*``: altitude levels per interval, azimuths and Gauss points at which sunlight is followed,
     phase functions apart.
-    ``orders``: most orders solved; fewer where the sum is steady to ``converged`` times the tolerance. ``columns``:
-    size of the sun-column table (altitudes, cosines).
+    ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
+    steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
+    ``deep``: altitudes are denser at the top than at the bottom: all the light of a white cloud passes there twice.
     """
 
     altitudes: int = 12
@@ -65,9 +69,10 @@ class Resolution:
     beam_refine: int = 2
     beam_azimuths: int = 4
     beam_nodes: int = 2
-    orders: int = 100
+    orders: int = 40
     converged: float = 1.0
     columns: tuple[int, int] = (128, 96)
+    deep: bool = False
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -87,20 +92,23 @@ class Resolution:
         later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
+        deep = float(np.max(np.multiply(*_scattering(atmosphere)))) > DEEP
         if thick:
-            first, later = min(first, 16), min(later, 8)
+            first, later = min(first, DEEP_DEGREE if deep else THICK_DEGREE), min(later, 8)
         first = next(degree for degree in FIRST_DEGREES if degree >= first)
         stages = [_stage(later), _stage((3 * later) // 4)]
         level = int(np.searchsorted(-np.array(FINER), -tolerance))
         altitudes = (8, 10, 12, 16)[level]
         if fine:
-            first = next((degree for degree in FIRST_DEGREES if degree >= first + FINE_DEGREES), FIRST_DEGREES[-1])
+            needed = max(first + FINE_DEGREES, FINE_TIMES * first)
+            first = next((degree for degree in FIRST_DEGREES if degree >= needed), FIRST_DEGREES[-1])
             up = max(10, 2 * first // 3)
             stages = [replace(stages[0], degree=first, up=up, down=up - 2)]
             altitudes += FINE_ALTITUDES
         return cls(
-            altitudes=_altitudes(atmosphere, altitudes, thick),
-            suns=(21, 25, 29, 33)[level],
+            altitudes=_altitudes(atmosphere, altitudes, thick, deep),
+            deep=deep,
+            suns=(21, 25, 29, 33)[level] + (FINE_SUNS if fine else 0),
             first_suns=(1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
             stages=tuple(dict.fromkeys(stages)),
@@ -159,15 +167,20 @@ def moments_of(phase: Any, degree: int) -> np.ndarray:
 _moments: dict[Any, np.ndarray] = {}
 
 
-def _altitudes(atmosphere: Atmosphere, clear: int, thick: bool) -> int:
+def _altitudes(atmosphere: Atmosphere, clear: int, thick: bool, deep: bool) -> int:
     """Node altitudes: more where the air is thick and scatters, in steps of four so that kernels are shared; up to
     twice as many more in ``thick`` air, where what each order lacks adds up unless light is absorbed first."""
+    scattering, white = _scattering(atmosphere)
+    per_doubling = 8.0 * (1.0 + thick * white)
+    extra = float(np.max(per_doubling * np.log2(1.0 + np.maximum(scattering - 0.3, 0.0) / 2.0)))
+    return DEEP_ALTITUDES if deep else min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
+
+
+def _scattering(atmosphere: Atmosphere) -> tuple[np.ndarray, np.ndarray]:
+    """Vertical optical depth of what scatters [W], and the part of the light that is left after MANY events."""
     depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.constituents)
     scattering, depth = sum(depths, start=np.zeros(1)), _depth(atmosphere)
-    albedo = np.divide(scattering, depth, out=np.zeros(depth.shape), where=depth > 0.0)
-    per_doubling = 8.0 * (1.0 + thick * albedo**MANY)
-    extra = float(np.max(per_doubling * np.log2(1.0 + np.maximum(scattering - 0.3, 0.0) / 2.0)))
-    return min(clear + 4 * int(np.ceil(extra / 4.0)), MOST_ALTITUDES)
+    return scattering, np.divide(scattering, depth, out=np.zeros(depth.shape), where=depth > 0.0) ** MANY
 
 
 def _depth(atmosphere: Atmosphere) -> np.ndarray:

@@ -25,9 +25,9 @@ from .backend import (
 )
 from .column import SunColumns
 from .field import Field
-from .geometry import safe_sine
+from .geometry import distance_up, safe_sine
 from .grid import Grid
-from .march import Rays, point_along, visible_sun
+from .march import Rays, march, point_along, visible_sun
 from .optics import PHASE_NODES, Optics, phase_node
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
@@ -124,7 +124,7 @@ def beam_along(
         cos_turn, sin_turn = packet(device.turns, visit, 2)
         return [dr.fma(cos_turn, mu_s, sin_turn * part) for part in across]
 
-    def visit(i: Any, sums: list[list[Any]], last: list[list[Any]]) -> tuple[Any, ...]:
+    def visit(i: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
         weight = row(weights.scattered, i, kinds * channels, alone=True) if kinds else []
         level = dr.gather(t.UInt, device.level, i)
         lights = [beam.at(level, mu) for mu in turned(i)]
@@ -132,24 +132,20 @@ def beam_along(
             [dr.fma(w, light[j % channels], s) for j, (w, s) in enumerate(zip(weight, old, strict=False))]
             for light, old in zip(lights, sums, strict=True)
         ]
-        # As a sum, like all that derivatives pass backwards through such a loop.
-        ends = dr.select(i + 1 < stop, t.Float(0.0), 1.0)
-        last = [
-            [dr.fma(ends, value, s) for value, s in zip(light, old, strict=True)]
-            for light, old in zip(lights, last, strict=True)
-        ]
-        return i + 1, new, last
+        return i + 1, new
 
     def zeros(count: int) -> list[list[Any]]:
         return [[dr.zeros(t.Float, dr.width(lane)) for _ in range(count)] for _ in range(together)]
 
+    _, sums = dr.while_loop(
+        (start, zeros(kinds * channels)), lambda i, _: i < stop, visit, max_iterations=-1, label="beam"
+    )
     # Light at the last visit is that of the ground, where the path ends there.
-    state = (start, zeros(kinds * channels), zeros(channels))
-    _, sums, last = dr.while_loop(state, lambda i, *_: i < stop, visit, max_iterations=-1, label="beam")
+    level = dr.gather(t.UInt, device.level, stop - 1)
     reflected = row(weights.reflected, stop - 1, channels)
     ground = []
-    for mu, light in zip(turned(stop - 1), last, strict=True):
-        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, light, strict=True)]
+    for mu in turned(stop - 1):
+        ground += [part * dr.maximum(mu, 0.0) * e for part, e in zip(reflected, beam.at(level, mu), strict=True)]
     scattered = [value for part in sums for value in part] or [t.Float(0.0)]
     return tuple(tables_of([scattered, ground], lane))
 
@@ -258,6 +254,18 @@ def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> li
     cosine = disc_cosine(mu_s, optics.sun_radius)
     depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
     return [solar * cosine * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
+
+
+def exact_sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> list[Any]:
+    """The same by a march in double precision, for Optics.exact and Float64 ``h`` and ``mu_s``: beside a step of
+    density, the table of columns is too coarse."""
+    t, r = types(), optics.radius + h
+    mu = dr.maximum(mu_s, -dr.safe_sqrt(h * (2.0 * optics.radius + h)) / r)
+    stop = distance_up(optics.radius, h, mu, optics.thickness)
+    rays = Rays(h, mu, mu, dr.zeros(t.Float64, 1) + 1.0, stop, t.Bool(False))
+    through = march(optics, columns, rays, single=False).transmittance
+    cosine = disc_cosine(t.Float(mu_s), optics.sun_radius)
+    return [solar * cosine * value for solar, value in zip(optics.solar, through, strict=True)]
 
 
 def disc_cosine(mu_s: Any, radius: Any) -> Any:

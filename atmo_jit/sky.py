@@ -32,12 +32,12 @@ from .optics import MAX_CHANNELS, Optics
 from .parameters import check_names
 from .pieces import Pieces, light_along
 from .resolution import Resolution
-from .single_scattering import ground_light, horizontal_irradiance
+from .single_scattering import exact_sun_irradiance, ground_light, horizontal_irradiance
 from .views import check_views, side_by_side
 
-# Share of the usual remainder that is left where derivatives are wanted: the shares in which orders count, which
-# stand for those left out, carry none.
-SURE = 0.003
+# Share of the usual remainder that is left where derivatives are wanted, and fine ones: those of the light that orders
+# left out would add are less exact than that light.
+SURE, FINE = 0.03, 0.003
 METHODS = ("auto", "tables", "march")
 VIEWS_AT_ONCE = 1 << 18  # bounds memory: a view costs some hundred bytes while it is marched
 
@@ -76,7 +76,7 @@ class Sky:
     be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
     used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
     :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
-    orders are solved, for derivatives (SURE); ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
+    orders are solved, for derivatives; ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
     InputError.
     """
 
@@ -105,7 +105,7 @@ class Sky:
         self.resolution = resolution or Resolution.suited(self.atmosphere, tolerance, fine=fine)
         count = len(self.atmosphere.wavelengths_nm)
         bands = [np.arange(i, min(i + MAX_CHANNELS, count)) for i in range(0, count, MAX_CHANNELS)]
-        remainder = SURE * tolerance if sure else tolerance
+        remainder = (FINE if fine else SURE) * tolerance if sure else tolerance
         self._bands: list[_Band] = []
         for band, values in zip(bands, held or [None] * len(bands), strict=True):
             optics = Optics(self.atmosphere, band, scattering_too)
@@ -123,10 +123,14 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns)
 
-    def columns_again(self, values: list[dict[str, Any]]) -> list[Any]:
-        """The tables of SunColumns for other ``values`` (Optics.values) of the bands."""
-        of_bands = zip(self._bands, values, strict=True)
-        return [sun_columns(band.optics.with_values(new), self.grid).table for band, new in of_bands]
+    def columns_again(self, values: list[dict[str, Any]], known: list[Any] | None = None) -> list[Any]:
+        """The tables of SunColumns for other ``values`` (Optics.values) of the bands, which may carry derivatives;
+        ``known``: their numbers."""
+        tables = []
+        for i, (band, new) in enumerate(zip(self._bands, values, strict=True)):
+            optics = band.optics.with_values(new)
+            tables.append(sun_columns(optics, self.grid, known=known[i] if known else None).table)
+        return tables
 
     def orders_again(
         self,
@@ -142,7 +146,7 @@ class Sky:
             optics, grid = band.optics.with_values(new), self.grid
             toward_sun = sun_columns(optics, grid, columns[i])
             of_solve = known and known[i]
-            done.append(orders_again(optics, toward_sun, grid, self.resolution, len(shares[i]) + 1, of_solve))
+            done.append(orders_again(optics, toward_sun, grid, self.resolution, shares[i], of_solve))
         return done
 
     def again(
@@ -213,21 +217,22 @@ class Sky:
             order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
             light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
             return light.taken(np.argsort(order))
-        rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
+        exact = pieces is None and shells is None and self._bands[0].optics.exact is not None
+        rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m, exact=exact)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
         for i, band in enumerate(self._bands):
             optics = band.optics
             band.field.prepare()
             if pieces is None:
-                light = march(optics, band.columns, rays, source=band.source, shells=shells)
+                light = march(optics.exact if exact else optics, band.columns, rays, source=band.source, shells=shells)
             else:
                 light = light_along(optics, band.columns, rays, pieces[i], source=band.source)
             dr.eval(light.single, light.multiple, light.transmittance)
             for c in range(optics.channel_count):
                 light.single[c] = light.single[c] + light.multiple[c]
             if ground:
-                for c, glow in enumerate(ground_light(optics, band.columns, rays, band.field)):
+                for c, glow in enumerate(ground_light(optics, band.columns, rays.single(), band.field)):
                     light.single[c] = dr.fma(light.transmittance[c], glow, light.single[c])
             transmittance += [dr.select(meets_air, value, 1.0) for value in light.transmittance]
             radiance += [dr.select(meets_air, value, 0.0) for value in light.single]
@@ -277,26 +282,37 @@ class Sky:
         """Irradiance of the sun and of the sky (scattered light) on a horizontal surface facing up at ``altitude_m``:
         lists of W Floats."""
         t = types()
-        h, mu_s = t.Float(altitude_m), t.Float(dr.cos(t.Float64(sun_zenith)))
+        exact = t.Float64(altitude_m), dr.cos(t.Float64(sun_zenith))
+        h, mu_s = (t.Float(v) for v in exact)
         h = dr.minimum(h + 0.0 * mu_s, self._bands[0].optics.thickness)
         dr.make_opaque(h, mu_s)
         sun, sky = [], []
         for band in self._bands:
             band.field.prepare()
             direct, scattered = horizontal_irradiance(band.optics, band.columns, band.field, h, mu_s)
+            if band.optics.exact is not None and not dr.grad_enabled(exact):
+                altitude = dr.minimum(exact[0] + 0.0 * exact[1], band.optics.exact.thickness)
+                direct = exact_sun_irradiance(band.optics.exact, band.columns, altitude, exact[1] + 0.0 * altitude)
             sun += direct
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky
 
     def enter(
-        self, altitude_m: Any, sun_zenith: Any, view_zenith: Any, azimuth: Any, distance_m: Any = None
+        self,
+        altitude_m: Any,
+        sun_zenith: Any,
+        view_zenith: Any,
+        azimuth: Any,
+        distance_m: Any = None,
+        *,
+        exact: bool = False,
     ) -> tuple[Rays, Any, Any]:
-        """Rays moved, in double precision, to where they enter the atmosphere; whether they meet air at all; whether
-        they leave for space."""
+        """Rays moved, in double precision, to where they enter the atmosphere, and left in it if ``exact``; whether
+        they meet air at all; whether they leave for space."""
         t = types()
         wide = t.Float64
         altitude, theta_s, theta, phi = (wide(v) for v in (altitude_m, sun_zenith, view_zenith, azimuth))
-        optics = self._bands[0].optics
+        optics = self._bands[0].optics.exact if exact else self._bands[0].optics
         radius, top = wide(optics.radius), wide(optics.thickness)
         mu, mu_s = dr.cos(theta), dr.cos(theta_s)
         nu = mu * mu_s + dr.sin(theta) * dr.sin(theta_s) * dr.cos(phi)
@@ -316,12 +332,13 @@ class Sky:
             nu,
         )
         rays = rays_to_boundary(optics, dr.minimum(altitude, top), *(dr.clip(v, -1.0, 1.0) for v in cosines))
+        rays = rays if exact else rays.single()
         meets_air = t.Bool(meets)
         rays.stop = dr.select(meets_air, rays.stop, 0.0)
         rays.ground &= meets_air
         if distance_m is None:
             return rays, meets_air, ~rays.ground
-        left = t.Float(dr.maximum(wide(distance_m) - gap, 0.0))
+        left = type(rays.stop)(dr.maximum(wide(distance_m) - gap, 0.0))
         ends = left >= rays.stop
         passes = ends & ~rays.ground & (meets_air | t.Bool(dr.isinf(wide(distance_m))))
         rays.ground &= ends

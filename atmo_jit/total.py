@@ -21,7 +21,8 @@ DARK = 1e-16
 # Depth of air that scatters nothing to speak of: the square of a smaller one, which is below the line in a derivative,
 # leaves single precision.
 NOTHING = 1e-15
-FEW_LEFT = 0.01  # of order 1, and their ratio is steady
+SAME = 1e-6  # share of an order, squared, that rounding may be: beside that two orders are multiples of each other
+MISSED = 0.03  # of order 2: light that two modes of orders may fail to foretell
 
 
 def total_of(
@@ -67,38 +68,49 @@ def following(
 ) -> list[tuple[Any, Any]]:
     """Shares of the orders that carry derivatives, for those of an extrapolation, which carry none.
 
-    Where few orders are left the last stands for all that follow it, which are geometric by then: it counts as
-    1 / (1 - rho), with rho the ratio of the last two orders, least squares over altitudes, and all others as 1.
+    The last three orders foretell those that follow: u_(n+1) = a u_n + b u_(n-1), two modes that fade geometrically,
+    with a and b from least squares over altitudes. So the last order counts as 1 / (1 - a - b), the one before as
+    1 + b / (1 - a - b), and all others as 1. Shares that were given stay where that misses too much.
     """
     if len(rest) < 2:
         return shares
     t, channels, suns = types(), rest[-1].channels, grid.shape[1]
+    wide = t.Float64  # two modes are told apart by a difference of squares
     lane = dr.arange(t.UInt, suns * channels)
     channel, sun = lane % channels, lane // channels
+    some = [rest[0], *rest[-3:]]
 
-    def add(i: Any, product: Any, square: Any) -> tuple[Any, ...]:
+    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         k, entry = i // 2, i % 2
         scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-        before, last = (
-            scale * dr.gather(t.Float, light.values, light.index(k, entry, sun, channel)) for light in rest[-2:]
-        )
-        return i + 1, dr.fma(before, last, product), dr.fma(before, before, square)
+        u = [wide(scale * dr.gather(t.Float, o.values, o.index(k, entry, sun, channel))) for o in some]
+        products = [u[0] * u[0], *(u[i] * u[j] for i in range(1, len(u)) for j in range(i, len(u)))]
+        return i + 1, [s + product for s, product in zip(sums, products, strict=True)]
 
-    zeros = [dr.zeros(t.Float, suns * channels) for _ in range(2)]
+    zeros = [dr.zeros(wide, suns * channels) for _ in range(4 if len(rest) == 2 else 7)]
     end = dr.opaque(t.UInt, 2 * grid.shape[0], 1)
-    _, product, square = dr.while_loop(
-        (t.UInt(0), *zeros), lambda i, *_: i < end, add, max_iterations=-1, label="following"
-    )
-    product, square = evaluated([product, square])
-    lit = square > DARK
-    ratio = dr.maximum(dr.select(lit, product / dr.select(lit, square, 1.0), 0.0), 0.0)
-    left = 1.0
-    for _ in rest:
-        left = left * dr.detach(ratio)
-    geometric = left < FEW_LEFT
-    last = 1.0 / (1.0 - dr.select(geometric, ratio, 0.0))
-    counts = evaluated([dr.select(geometric, last, share) for share in shares[-1]])
-    return [*([dr.select(geometric, 1.0, share) for share in both] for both in shares[:-1]), counts]
+    _, sums = dr.while_loop((t.UInt(0), zeros), lambda i, _: i < end, add, max_iterations=-1, label="following")
+    whole, *products = evaluated(sums)
+    if len(rest) == 2:
+        older = older_before = older_last = dr.zeros(wide, suns * channels)
+        before, mixed, last = products
+    else:
+        older, older_before, older_last, before, mixed, last = products
+    lit = before > DARK
+    per_before = dr.select(lit, 1.0 / dr.select(lit, before, 1.0), 0.0)
+    ratio, shared = mixed * per_before, older_before * per_before
+    apart = older - shared * older_before  # what of u_(n-2) is no multiple of u_(n-1), squared
+    told = lit & (apart > SAME * older)
+    b = dr.select(told, (older_last - shared * mixed) / dr.select(told, apart, 1.0), 0.0)
+    a = ratio - b * shared
+    missed = dr.maximum(last - a * mixed - b * older_last, 0.0)
+    fades = (a + b >= 0.0) & (a + b < 1.0)
+    per_left = 1.0 / dr.select(fades, 1.0 - a - b, 1.0)
+    known = fades & (dr.detach(missed * per_left * per_left) < MISSED**2 * dr.detach(whole))
+    counts = [dr.fma(b, per_left, 1.0), per_left][-min(2, len(rest)) :]
+    counts = evaluated([dr.select(known, t.Float(count), 0.0) for count in counts])
+    ends = [[dr.select(known, c, share) for share in both] for c, both in zip(counts, shares[-2:], strict=True)]
+    return [*([dr.select(known, 1.0, share) for share in both] for both in shares[:-2]), *ends]
 
 
 def _rest(

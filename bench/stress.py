@@ -32,6 +32,7 @@ from .monte_carlo import load_twins
 
 PER_WORLD = 500  # views of one atmosphere
 TWIN_VIEWS = 6  # of them compared with the twin, which is slow
+TWIN_TOLERANCE = 1e-6  # to which it halves pieces of rays
 SOLVES_EVERY = 4  # atmospheres: one in so many is solved several times
 CLEAR = 5.0  # optical depth up to which the twin's quadrature is a truth for scattered light
 FAINT = 1e-3  # of the brightest single scattering under the same sun: errors of fainter light are relative to this
@@ -251,7 +252,8 @@ def sweep(
         rng = Random(number)
         world = extreme_world(rng)
         views = extreme_views(rng, world, per_world)
-        tally.add(number, check_world(world, views, twins.Twin(world), solves=number % SOLVES_EVERY == 0))
+        twin = twins.Twin(world, tolerance=TWIN_TOLERANCE)
+        tally.add(number, check_world(world, views, twin, solves=number % SOLVES_EVERY == 0))
         if advance:
             advance((i + 1) / count)
     return tally

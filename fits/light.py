@@ -16,6 +16,7 @@ from atmo_jit.backend import doubles, floats
 from atmo_jit.march import NODES, Shells
 from atmo_jit.optics import MAX_CHANNELS, on_device
 from atmo_jit.recording import Recordings
+from atmo_jit.remainder import joined, parted
 from atmo_jit.sky import Sky
 
 
@@ -43,7 +44,7 @@ class RayLight:
         kinds = [band.optics.phase_kinds for band in sky.solutions]
         make_up = sky.solutions[0].optics.make_up
         self._recorded = None not in kinds
-        grid, key = sky.grid, (len(channels), len(self._shares[0]), make_up, kinds[0])
+        grid, key = sky.grid, (len(channels), *map(_sizes, self._shares), make_up, kinds[0])
         grid.kept("shells of fits", lambda: _shells(sky))
 
         def made() -> Any:
@@ -98,14 +99,33 @@ def _distinct(
 def _shares(sky: Sky, channels: np.ndarray) -> list[Any]:
     """Shares of the orders (Field.shares) of a sky, of some of its wavelengths in bands; 0 for orders that were not
     solved at all wavelengths."""
-    most = max(len(band.field.shares) for band in sky.solutions)
-    table = np.zeros((most, 2, sky.grid.shape[1], len(sky.atmosphere.wavelengths_nm)), np.float32)
-    for band in sky.solutions:
-        for n, both in enumerate(band.field.shares):
+    bands = [(band.optics.indices, *parted(band.field.shares)) for band in sky.solutions]
+    most = max(len(counts) - (tail is not None) for _, counts, tail in bands)
+    table = np.zeros((most + 1, 2, sky.grid.shape[1], len(sky.atmosphere.wavelengths_nm)), np.float32)
+    tails: list[Any] = [None] * table.shape[-1]
+    for indices, counts, tail in bands:
+        for n, both in enumerate(counts):
+            at = most if tail is not None and n == len(counts) - 1 else n
             for i, share in enumerate(both):
-                table[n, i][:, band.optics.indices] = share.numpy().reshape(-1, len(band.optics.indices))
-    bands = [table[..., channels[i : i + MAX_CHANNELS]] for i in range(0, len(channels), MAX_CHANNELS)]
-    return [[[floats(share) for share in both] for both in band] for band in bands]
+                table[at, i][:, indices] = share.numpy().reshape(-1, len(indices))
+        for place, index in enumerate(indices):
+            tails[index] = tail, place, len(indices)
+    made = []
+    for i in range(0, len(channels), MAX_CHANNELS):
+        some = channels[i : i + MAX_CHANNELS]
+        shares: list[Any] = [[floats(share) for share in both] for both in table[..., some]]
+        parts = [tails[c] for c in some]
+        last = shares.pop()
+        if any(tail for tail, _, _ in parts):
+            shares.append({**joined(parts), "shares": last})
+        made.append(shares)
+    return made
+
+
+def _sizes(shares: list[Any]) -> tuple[int, int]:
+    """How many orders are counted, and how many turns the remainder takes."""
+    tail = parted(shares)[1]
+    return len(shares), len(tail["turns"]) if tail else 0
 
 
 def _shells(sky: Sky) -> Shells:

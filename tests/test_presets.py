@@ -11,6 +11,7 @@ import pytest
 from atmo_jit import presets
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.earth import earth_at
+from atmo_jit.optics import Optics
 
 
 @pytest.mark.parametrize("name", presets.NAMES)
@@ -18,6 +19,12 @@ def test_presets_are_complete(name):
     air = Atmosphere.load(name)
     assert air.to_dict() == presets.read(name)
     assert len(air.constituents) >= 2 and presets.SOURCES[name]
+
+
+@pytest.mark.parametrize("name", presets.NAMES)
+def test_presets_need_no_altitudes_in_double_precision(name):
+    """Which take a tenth longer."""
+    assert Optics(Atmosphere.load(name), np.arange(1)).exact is None
 
 
 @pytest.mark.parametrize("kind", ["continental", "maritime", "desert", "urban"])

@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 LADDER = 9
 """Number of altitudes, besides the profile's own kinks, at which rays are cut into pieces."""
 
+HALVINGS = 40
+"""At most so many times are pieces of rays halved to a tolerance: 1e-12 of a piece."""
+
 DEEP, LEVELS = 100.0, (1, 2, 3, 4, 6, 8, 10, 13, 16, 20)
 """Scale heights of air from which on rays are cut at these multiples of the scale height too."""
 
@@ -96,10 +99,12 @@ class Twin:
     """The atmosphere of one contract JSON block (a ``dict``, not a preset's name), integrated by brute force.
 
     ``nodes`` is the number of Gauss-Legendre nodes on each smooth piece of a view ray, ``sun_nodes`` that on each
-    piece of the way from a point to the sun.
+    piece of the way from a point to the sun. ``tolerance``: pieces of view rays are halved until that changes single
+    scattering by less, relative to the ray's.
     """
 
-    def __init__(self, spec: Mapping, nodes: int = 6, sun_nodes: int = 6):
+    def __init__(self, spec: Mapping, nodes: int = 6, sun_nodes: int = 6, tolerance: float | None = None):
+        self.tolerance = tolerance
         self.wavelengths_nm = np.atleast_1d(np.asarray(spec["wavelengths_nm"], float))
         self.width = self.wavelengths_nm.size
         self.solar = self._per_wavelength(spec["solar_irradiance"])
@@ -312,25 +317,46 @@ class Twin:
         enter, leave = self.limits(h, mu)
         leave = np.maximum(enter, np.minimum(leave, limit))
         cuts = self._sun_cuts(h, mu, mu_s, nu, self._cuts(h, mu, enter, leave))
-        ray, t, weight = self._points(cuts, self.view_rule)
-        at = np.maximum(self.altitude(h[ray], mu[ray], t), 0.0)
-        local = np.clip(((self.radius + h[ray]) * mu_s[ray] + t * nu[ray]) / (self.radius + at), -1, 1)
-        lit = self.visible_fraction(at, local) > 0
-        ray, t, weight, at, local = ray[lit], t[lit], weight[lit], at[lit], local[lit]
-        light = self.sun_transmittance(at, local)
-        # Column from the observer to each node: sum of whole steps between neighbouring nodes of the same ray.
-        before = np.where(np.r_[True, ray[1:] != ray[:-1]], enter[ray], np.r_[0.0, t[:-1]]) if ray.size else t
-        between = self.columns(h[ray], mu[ray], before, t)
-        total = np.cumsum(between, axis=0)
-        first = np.searchsorted(ray, ray)
-        light *= np.exp(-self.optical_depth(total - (total - between)[first]))
+        ray, piece = np.nonzero(np.diff(cuts, axis=1) > 0)
+        near, far = cuts[ray, piece], cuts[ray, piece + 1]
         out = np.zeros((h.size, self.width))
+
+        def light(ray: NDArray[np.intp], near: Array, far: Array) -> Array:
+            return self._of_pieces((h, mu, mu_s, nu), enter, ray, near, far)
+
+        whole = light(ray, near, far)
+        np.add.at(out, ray, whole)
+        for _ in range(HALVINGS if self.tolerance else 0):
+            middle = (near + far) / 2
+            halves = light(np.tile(ray, 2), np.r_[near, middle], np.r_[middle, far]).reshape(2, -1, self.width)
+            off = halves.sum(axis=0) - whole
+            np.add.at(out, ray, off)
+            again = (np.abs(off) > self.tolerance * np.abs(out[ray])).any(axis=1)
+            if not again.any():
+                break
+            near, far = np.r_[near[again], middle[again]], np.r_[middle[again], far[again]]
+            ray, whole = np.tile(ray[again], 2), halves[:, again].reshape(-1, self.width)
+        return self.solar * out
+
+    def _of_pieces(
+        self, rays: tuple[Array, ...], enter: Array, ray: NDArray[np.intp], near: Array, far: Array
+    ) -> Array:
+        """Radiance [pieces, W] per unit of solar irradiance that comes from pieces of rays (h, mu, mu_s, nu)."""
+        h, mu, mu_s, nu = (v[ray] for v in rays)
+        before = self.columns(h, mu, enter[ray], near)
+        piece, t, weight = self._points(np.column_stack([near, far]), self.view_rule)
+        h, mu, mu_s, nu = (v[piece] for v in (h, mu, mu_s, nu))
+        at = np.maximum(self.altitude(h, mu, t), 0.0)
+        local = np.clip(((self.radius + h) * mu_s + t * nu) / (self.radius + at), -1, 1)
+        lit = self.visible_fraction(at, local) > 0
+        piece, t, weight, at, local, h, mu, nu = (v[lit] for v in (piece, t, weight, at, local, h, mu, nu))
+        through = before[piece] + self.columns(h, mu, near[piece], t)
+        seen = self.sun_transmittance(at, local) * np.exp(-self.optical_depth(through))
+        source = np.zeros_like(seen)
         for s in self.species:
             if s.phase is not None:
-                source = (weight * s.density(at))[:, None] * light
-                summed = np.column_stack([np.bincount(ray, source[:, w], h.size) for w in range(self.width)])
-                out += s.scattering * s.phase(nu) * summed
-        return self.solar * out
+                source += s.scattering * s.phase(nu) * (weight * s.density(at))[:, None] * seen
+        return np.column_stack([np.bincount(piece, source[:, w], near.size) for w in range(self.width)])
 
     def ground_direct(
         self, h: ArrayLike, mu: ArrayLike, mu_s: ArrayLike, nu: ArrayLike, distance: ArrayLike | None = None

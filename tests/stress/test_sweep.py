@@ -24,7 +24,9 @@ LIMITS = dict.fromkeys(COUNTS, 0.0) | {
     "transmittance rises along a ray": 1e-6,
     "mirror symmetry": 1e-3,
     "zero distance": 0.0,
-    "transmittance, twin": 1e-3,
+    "reciprocity": 1e-3,
+    "additivity": 1e-3,
+    "transmittance, twin": 1e-4,
     "adjoint identity": 1e-3,
 }
 
@@ -68,18 +70,21 @@ def test_fog_in_one_wavelength_costs_no_more_than_fog():
     assert np.isfinite(radiance).all() and transmittance[:, 0] == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("depth", [1.0, 10.0, pytest.param(20.0, marks=pytest.mark.slow)])
+SLOW_DEPTHS = [pytest.param(depth, marks=pytest.mark.slow) for depth in (20.0, 80.0, 160.0)]
+
+
+@pytest.mark.parametrize("depth", [1.0, 10.0, 40.0, *SLOW_DEPTHS])
 def test_nothing_is_lost_in_white_clouds(depth):
-    """A gas over white ground; at depth 20 it is a hundred orders that are summed."""
+    """A gas over white ground; from depth 20 on a hundred orders would not do."""
     gas = {"scattering_per_m": depth / 5000.0, "scale_height_m": 5000}
     air = world(wavelengths_nm=[550], solar_irradiance=1, rayleigh=gas, mie=None, ground_albedo=1.0)
     assert returned_light(air, Twin(air), azimuths=8, nodes=8) == pytest.approx(1.0, abs=0.002)
 
 
-@pytest.mark.parametrize("depth", [pytest.param(0.3, marks=pytest.mark.slow), 3.0])
-def test_nothing_is_gained_in_white_haze(depth):
+@pytest.mark.parametrize("depth", [pytest.param(0.3, marks=pytest.mark.slow), 3.0, *SLOW_DEPTHS, 40.0])
+def test_nothing_is_gained_or_lost_in_white_haze(depth):
     """Radiance of one order, made of a few azimuthal harmonics, swings below 0 beside a forward peak: cut off there it
-    gained 2 %."""
+    gained 2 %. Nor is anything lost where it is thick."""
     haze = {
         "scattering_per_m": depth / 2000.0,
         "single_scattering_albedo": 1.0,
@@ -91,11 +96,6 @@ def test_nothing_is_gained_in_white_haze(depth):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="atmosphere 506 has observers 34 m under a step 34,000 km up, where altitudes in single precision are 4 m "
-    "apart: its transmittance is 1.3e-3 off; docs/limits.md",
-)
 def test_more_of_the_sweep():
     holds(sweep(5000, first=500, per_world=500))
 
