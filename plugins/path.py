@@ -76,8 +76,8 @@ class AtmospherePath:
 
      * - orders
        - |int|
-       - How often light is scattered in the air or reflected by the planet's ground, at most. Derivatives of pictures
-         with a limit take light behind shapes as if it had all orders that are left at the camera. (Default: no limit)
+       - How often light is scattered in the air or reflected by the planet's ground, at most.
+         (Default: no limit)
 
      * - shaft_samples
        - |int|
@@ -378,13 +378,11 @@ class AtmospherePath:
         return dr.select(scene.ray_test(mi.Ray3f(p, toward), active), 0.0, 1.0)
 
     def _parts(self, scene: Any) -> tuple[Skylight, Airlight, Colours]:
-        """The light of the scene's emitter, its air and the colours of both, made again where the emitter changed or
-        the box about all shapes."""
+        """The light of the scene's emitter, its air and the colours of both, made again where the emitter changed."""
         if self._moving is not None:
             return self._moving
         emitter = self._emitter(scene)
-        box = scene.bbox()  # what shapes hide is known in there
-        key = id(emitter), id(emitter.sky_light), id(emitter.sky), *np.array(box.min), *np.array(box.max)
+        key = id(emitter), id(emitter.sky_light), id(emitter.sky)
         if self._held is None or self._held[0] != key:
             sky = emitter.sky
             if self.exposed is not None or self.orders is not None:

@@ -441,25 +441,3 @@ def test_the_unit_of_length_does_not_matter(rgb):
     np.testing.assert_allclose(pictures[1].mean(axis=(0, 1)), pictures[0].mean(axis=(0, 1)), rtol=2e-3)
     np.testing.assert_allclose(pictures[2].mean(axis=(0, 1)), pictures[0].mean(axis=(0, 1)), rtol=2e-3)
     assert np.median(np.abs(pictures[1] / pictures[0] - 1.0)) < 5e-3
-
-
-def test_a_shape_may_move_out_of_the_room_it_was_in(rgb):
-    """What shapes hide is known in the box about them: it is made again for another box."""
-
-    def scene(height):
-        to_world = mi.ScalarTransform4f().translate([0, 3000, height]).scale([500, 500, 500])
-        parts = {
-            "integrator": {"type": "atmosphere_path", "max_depth": 2},
-            "sky": {"type": "atmosphere", "atmosphere": json.dumps(HAZE), "sun_direction": SUN.tolist()},
-            "sensor": camera(8, 8, [0, -4000, 10], [0, 3000, 1500]),
-            "tower": {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse"}},
-        }
-        return mi.load_dict({"type": "scene", **parts})
-
-    moved, there = scene(500), scene(4000)
-    mi.render(moved, spp=4, seed=0)
-    parameters = mi.traverse(moved)
-    parameters["tower.vertex_positions"] = mi.traverse(there)["tower.vertex_positions"]
-    parameters.update()
-    found, want = (np.array(mi.render(one, spp=4, seed=0)) for one in (moved, there))
-    assert found == pytest.approx(want, rel=1e-5)
