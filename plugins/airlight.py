@@ -23,7 +23,6 @@ from atmo_jit.sky import Sky
 
 from .exposed import number
 from .globe import Globe
-from .open_sky import OpenSky
 
 NODES = 2  # of each piece of a ray; `python -m bench.airlight` has what that costs beside the four of Sky.rays
 STEP = 0.6180339887498949  # of random numbers from point to point of a ray: the golden ratio's
@@ -67,7 +66,6 @@ class Airlight:
         self.densest = float(max(np.array(v).max(initial=0.0) for v in ground))  # 1/m, at the ground
         self.sun = mi.Vector3f(*(float(v) for v in sun))
         dr.make_opaque(self.sun)
-        self.open_sky: OpenSky | None = None  # where shapes keep light from the air
 
     def _take(self, sky: Sky) -> None:
         self.bands = sky.bands
@@ -77,7 +75,6 @@ class Airlight:
         """The light of another sky, at the points and by the pieces of rays that serve this one."""
         other = copy(self)
         other._take(sky)
-        other.open_sky = self.open_sky and self.open_sky.moved([sky])
         return other
 
     @property

@@ -18,7 +18,6 @@ from .exposed import array, host
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
 from .linearized import Changes, LinearizedSky, unit_changes
-from .open_sky import OpenSky
 from .shaded_air import later_orders
 from .shadow_volume import shadowed_interval
 from .skylight import Skylight
@@ -31,7 +30,6 @@ LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thi
 # bound of 1 would make shadows too bright.
 MOST_HIDDEN = 2.0
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
-LEVELS = 6  # numbers of orders, at most, for which light behind shapes is known apart
 SCALES = ("sun_scale", "sky_scale")
 TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
@@ -76,8 +74,8 @@ class AtmospherePath:
 
      * - orders
        - |int|
-       - How often light is scattered in the air or reflected by the planet's ground, at most.
-         (Default: no limit)
+       - How often light is scattered in the air or reflected by the planet's ground, at most. With 3 or
+         more, but a limit, shapes take away too much: the field behind them has orders of its own. (Default: no limit)
 
      * - shaft_samples
        - |int|
@@ -199,7 +197,7 @@ class AtmospherePath:
         if self._solved is None or self._solved.atmosphere != air:
             self._solved = LinearizedSky(air, self.orders)
         apart, skies = self._solved.ends({name: v for name, v in changes.items() if name not in SCALES})
-        light, middle, colours = self._made(scene, emitter, self._solved.sky)
+        light, middle, colours = self._made(emitter, self._solved.sky)
         pictures = []
         with dr.suspend_grad():
             for sky, sign in zip(skies, (-0.5, 0.5), strict=True):
@@ -252,7 +250,7 @@ class AtmospherePath:
             shows = active & (surface | (depth > 0) | ~mi.Bool(self.hide_emitters))
 
             grounded = active & part.ground & ~surface
-            inscatter, surfaces = self._inscatter(scene, sampler, ray, part, light, air, colours, passed, depth, active)
+            inscatter, surfaces = self._inscatter(scene, sampler, ray, part, light, air, colours, passed, active)
             lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
             disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
             disc = dr.select(active & ~surface & ~grounded, disc * light.sun_squeeze, 0.0)
@@ -343,7 +341,6 @@ class AtmospherePath:
         air: Airlight,
         colours: Colours,
         passed: list[Any],
-        depth: Any,
         active: Any,
     ) -> tuple[list[Any], Any]:
         """What the air of a segment scatters, less what shapes keep from it (W); and what it scatters of their
@@ -359,11 +356,9 @@ class AtmospherePath:
 
         missing = air.shade(part, start, end, sample, self.shaft_samples, lit)
         surfaces = mi.UnpolarizedSpectrum(0.0)
-        if air.open_sky is not None:
+        if None not in air.sources:
             most = None if self.orders is None else self.orders - 1
-            later, surfaces = later_orders(
-                air, scene, sampler, ray, part, toward, passed, colours, most, depth > 0, active
-            )
+            later, surfaces = later_orders(air, scene, sampler, ray, part, toward, passed, colours, most, active)
             missing = [a + b for a, b in zip(missing, later, strict=True)]
         return [a - dr.minimum(b, MOST_HIDDEN * a) for a, b in zip(part.light, missing, strict=True)], surfaces
 
@@ -387,7 +382,7 @@ class AtmospherePath:
             sky = emitter.sky
             if self.exposed is not None or self.orders is not None:
                 sky = Sky(self.exposed.atmosphere if self.exposed else sky.atmosphere, self.orders)
-            self._held = key, emitter, self._made(scene, emitter, sky)  # the emitter, so that no other gets its id
+            self._held = key, emitter, self._made(emitter, sky)  # the emitter, so that no other gets its id
         self._held[2][0].refresh()
         return self._held[2]
 
@@ -397,17 +392,12 @@ class AtmospherePath:
             raise InputError(f"atmosphere_path: the scene has {len(found)} emitters of type atmosphere; must be one")
         return found[0]
 
-    def _made(self, scene: Any, emitter: Any, sky: Sky) -> tuple[Skylight, Airlight, Colours]:
+    def _made(self, emitter: Any, sky: Sky) -> tuple[Skylight, Airlight, Colours]:
         center = self.center
         if center is None:
             distance = sky.atmosphere.bottom_radius_m + emitter.altitude_m
             center = -distance * self.scale * emitter.up
         air = Airlight(sky, Globe(sky.atmosphere, center, self.scale), emitter.sun)
-        if self._shades(scene, air) and None not in air.sources:
-            # Light that a shape hides has been scattered less often than all that the field may hold.
-            most = [] if self.orders is None else range(self.orders - 1, max(self.orders - 1 - LEVELS, 0), -1)
-            skies = [Sky(sky.atmosphere, n) for n in most] or [sky]
-            air.open_sky = OpenSky(skies, air.globe, scene.bbox(), emitter.sun)
         return Skylight(emitter, air.solar, SKY_SHARE), air, Colours(sky.atmosphere)
 
     def to_string(self) -> str:
