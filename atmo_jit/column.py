@@ -25,6 +25,7 @@ from . import noted
 from .backend import floats, packet, parameter, row, sum_loop, table_of, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
+from .levels import thinnest
 from .optics import Optics
 from .profile import Exponential
 from .quadrature import gauss_legendre
@@ -47,7 +48,7 @@ class SunColumns:
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
         atmosphere, breaks = optics.atmosphere, optics.breaks_m
-        knee = 0.7 * np.sqrt(2.0 * optics.thinnest_m / atmosphere.bottom_radius_m)
+        knee = 0.7 * np.sqrt(2.0 * thinnest(atmosphere) / atmosphere.bottom_radius_m)
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
         self._rows = max(4, round(size[0] / self._shells))  # intervals per shell

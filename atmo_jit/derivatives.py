@@ -35,7 +35,7 @@ from .parameters import (
 )
 from .pieces import Pieces
 from .resolution import Resolution
-from .sky import Sky
+from .solved import Sky
 from .views import check_views
 
 GEOMETRY = ("radius", "thickness")  # of Optics.values, and

@@ -12,7 +12,7 @@ from ._trees import flat, like
 from .backend import doubles, evaluated, traversing, types
 from .parameters import VIEWS
 from .recording import Recordings, copied
-from .sky import Sky
+from .solved import Sky
 
 OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
 

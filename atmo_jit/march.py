@@ -19,6 +19,7 @@ import numpy as np
 from .backend import floats, packet, parameter, row, table_of, types
 from .column import SunColumns
 from .geometry import UPRIGHT, altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
+from .levels import corners
 from .optics import Optics
 from .quadrature import gauss_legendre, running_integral
 
@@ -118,7 +119,7 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     disc = [-1.0, 1.0] if optics.atmosphere.sun_angular_radius_deg > 0.0 else []
     sets = [sign * optics.radius * optics.sun_radius for sign in disc]
     own = r * rays.mu
-    for k, moved in [*((parameter(level), None) for level in optics.edge_levels_m), *((0.0, by) for by in sets)]:
+    for k, moved in [*((parameter(level), None) for level in corners(optics.atmosphere)), *((0.0, by) for by in sets)]:
         along = axial if moved is None else axial - moved
         b = own - along * rays.nu
         c = (rays.h - k) * (2.0 * radius + rays.h + k) - along * along

@@ -9,31 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from copy import copy
 from dataclasses import fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from . import levels
 from ._trees import flat, like
 from .atmosphere import Atmosphere
 from .backend import doubles, floats, parameter, spread, table, types
 from .phase import CornetteShanks, HenyeyGreenstein, RayleighPhase
-from .profile import Exponential, Tabulated, Tent
-from .resolution import moments_of
+from .phase_series import distinct, of_asymmetry, phase_moments, phase_series
+from .profile import Exponential, Tabulated
 
-FEW_CORNERS = 8
-PHASE_NODES = 513
 MAX_CHANNELS = 4  # one 128-bit packet: wavelengths share every gather of geometry and sun angle
-# Scale heights at which rays are cut: the field is asked once between two cuts.
-LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
-# In fog, more: as long as a horizontal ray there has this optical depth.
-FURTHER, THIN = 4.0, 0.05
-RAMP, THICK = 0.25, 4.0
-STEEPER = 4.0
 # Altitudes in single precision are rounded by ROUNDING of themselves; an error of UNSEEN of an optical depth is small.
 ROUNDING, UNSEEN, SELDOM = 6e-8, 1e-5, 0.01
-FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
 _VALUES = (
     "radius",
     "thickness",
@@ -105,7 +97,7 @@ class Optics:
         [points] of tabulated profiles and [rows, columns] of phase tables."""
         i = self.indices
         parts = atmosphere.constituents
-        phases = [_distinct([c.phase.at(int(j)) for j in i] if c.phase else [])[0] for c in parts]
+        phases = [distinct([c.phase.at(int(j)) for j in i] if c.phase else [])[0] for c in parts]
         made: dict[str, Any] = {
             "radius": atmosphere.bottom_radius_m,
             "thickness": atmosphere.thickness_m,
@@ -255,7 +247,7 @@ class Optics:
     def _phases(self, constituent: int) -> tuple[list[Any], list[int]]:
         """The phase functions that differ, and which of them is that of each channel."""
         phase = self.constituents[constituent].phase
-        phases, place = _distinct([phase.at(int(i)) for i in self.indices])
+        phases, place = distinct([phase.at(int(i)) for i in self.indices])
         if self.asymmetry[constituent]:
             phases = [replace(p, g=g) for p, g in zip(phases, self.asymmetry[constituent], strict=True)]
         return phases, place
@@ -268,7 +260,7 @@ class Optics:
         return table(self._phase_series(self.atmosphere, degree))
 
     def _phase_series(self, atmosphere: Atmosphere, degree: int) -> np.ndarray:
-        return _phase_series(self._phases_of(atmosphere), degree)
+        return phase_series(self._phases_of(atmosphere), degree)
 
     def phase_moments(self, degree: int) -> Any:
         """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
@@ -279,13 +271,13 @@ class Optics:
     def scatterers_moments(self, degree: int, atmosphere: Atmosphere | None = None) -> np.ndarray:
         """Legendre moments chi_l of the scatterers, or of those of an ``atmosphere`` like this: [l, scatterer x
         channel]."""
-        return _phase_moments(self._phases_of(atmosphere or self.atmosphere), degree)
+        return phase_moments(self._phases_of(atmosphere or self.atmosphere), degree)
 
     def _phases_of(self, atmosphere: Atmosphere) -> tuple[Any, ...]:
         """The scatterers' phase functions in every channel."""
         phases = [atmosphere.constituents[k].phase for k in self.scatterers]
         alone = [phase.at(int(i)) for phase in phases for i in self.indices]
-        return tuple(_of_asymmetry(type(p), float(p.g)) if hasattr(p, "g") else p for p in alone)
+        return tuple(of_asymmetry(type(p), float(p.g)) if hasattr(p, "g") else p for p in alone)
 
     @property
     def profiles_differentiable(self) -> bool:
@@ -295,135 +287,8 @@ class Optics:
 
     @cached_property
     def breaks_m(self) -> np.ndarray:
-        """Altitudes (m), ascending from 0 to the top, between which every profile is smooth and changes by a few
-        e-folds at most."""
-        top = self.atmosphere.thickness_m
-        levels = [0.0, top]
-        radius = self.atmosphere.bottom_radius_m
-        kinks = {k for c in self.constituents for k in c.profile.kinks_m}
-        for c in self.constituents:
-            extinction = float(np.max(c.extinction_per_m))
-            if isinstance(c.profile, Exponential):
-                levels += _scale_height_levels(c.profile.scale_height_m, extinction, radius, top)
-            else:
-                kinks.update(_ramp_levels(c.profile, extinction, radius))
-                kinks.update(self._under_steps(c))
-        levels += kinks
-        # Not np.unique: in its first call it imports all of numpy.ma.
-        levels = np.array(sorted(set(np.clip(levels, 0.0, top).tolist())))
-        # A scale-height level beside another break only costs time; kinks stay. How near is near depends on the level
-        # alone: under a top a hundred thousand scale heights up the air at the ground is as steep as under a low one.
-        kept = [0.0]
-        for level in levels[1:]:
-            if level in kinks or level > 1.25 * kept[-1]:
-                kept.append(float(level))
-        if kept[-1] != top:
-            kept.append(top)
-        return np.array(kept)
-
-    def _under_steps(self, c: Any) -> list[float]:
-        return _levels_under_steps(c.profile, float(np.max(c.extinction_per_m)), self.atmosphere.bottom_radius_m)
-
-    @property
-    def thinnest_m(self) -> float:
-        """Scale (m) of the altitudes over which the steepest profile changes."""
-        scales = [self.atmosphere.thickness_m]
-        for c in self.constituents:
-            if isinstance(c.profile, Exponential):
-                scales.append(c.profile.scale_height_m)
-            elif isinstance(c.profile, Tent):
-                scales.append(c.profile.half_width_m)
-            else:
-                under = self._under_steps(c)
-                scales += [float(c.profile.altitude_m[np.searchsorted(c.profile.altitude_m, h)]) - h for h in under]
-        return min(scales)
-
-    @cached_property
-    def edge_levels_m(self) -> list[float]:
-        """Altitudes (m) at which a grazing sunbeam's column is not smooth: the ground, the top, corners of tents,
-        steps of tables.
-
-        The other corners of a tabulated profile count where they are few; where they are many they are slight, and
-        are left to the quadrature.
-        """
-        top = self.atmosphere.thickness_m
-        kinks: set[float] = set()
-        for profile in (c.profile for c in self.constituents):
-            if isinstance(profile, Tent):
-                kinks.update(profile.kinks_m)
-            if isinstance(profile, Tabulated):
-                kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
-        return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
-
-
-def _scale_height_levels(height: float, extinction: float, radius: float, top: float) -> list[float]:
-    """Altitudes (m) at which an exponential profile is cut."""
-    levels = [height * f for f in LEVELS]
-    horizontal = extinction * np.sqrt(2.0 * np.pi * (radius + top) * height)
-    while levels[-1] < top and horizontal * np.exp(-levels[-1] / height) > THIN:
-        levels.append(levels[-1] + FURTHER * height)
-    return levels
-
-
-def _ramp_levels(profile: Tent | Tabulated, extinction: float, radius: float) -> list[float]:
-    """Altitudes (m) between the corners of a profile at which it has fallen by a factor RAMP, again and again, as long
-    as a ray through what is below that may be thick: one that grazes the thin end meets as little as it is."""
-    if isinstance(profile, Tent):
-        altitude, density = np.array(profile.kinks_m), np.array([0.0, 1.0, 0.0])
-    else:
-        altitude, density = profile.altitude_m, profile.values
-    low, high = altitude[:-1], altitude[1:]
-    dense, thin = np.maximum(density[:-1], density[1:]), np.minimum(density[:-1], density[1:])
-    depth = 2.0 * extinction * dense * np.sqrt(np.maximum((high - low) * (2.0 * radius + low + high), 0.0))
-    levels = []
-    for i in np.flatnonzero((high > low) & (thin < RAMP * dense) & (RAMP * depth > THICK)):
-        count = np.arange(1, 1 + int(np.log(depth[i] / THICK) / -np.log(RAMP)))
-        parts = RAMP**count * dense[i]
-        parts = parts[parts > thin[i]]
-        at = (parts - density[i]) / (density[i + 1] - density[i])
-        levels += (low[i] + at * (high[i] - low[i])).tolist()
-    return levels
-
-
-def phase_node(nu: Any) -> Any:
-    """Where a cosine ``nu`` lies among the PHASE_NODES of Optics.phase_table, from 0 at -1 to PHASE_NODES - 1 at 1.
-
-    Nodes are uniform in sqrt(1 - abs(nu)) on both sides, nearly in the angle: uniform in the cosine a peak of g = 0.85
-    has so few that linear interpolation makes it up to a third too bright.
-    """
-    middle = 0.5 * (PHASE_NODES - 1)
-    step = middle * dr.safe_sqrt(1.0 - dr.abs(nu))
-    return dr.select(nu > 0.0, 2.0 * middle - step, step)
-
-
-def _levels_under_steps(profile: Tent | Tabulated, extinction: float, radius: float) -> list[float]:
-    """Altitudes (m) under the steps at which a layer ends: a low sun shines into its top alone.
-
-    From a depth under the step at which a horizontal ray comes upon an optical depth of 1, by factors STEEPER, to that
-    at which a vertical ray does: from there on the view's own optical depth cuts it.
-    """
-    if isinstance(profile, Tent):
-        return []
-    altitude, density = profile.altitude_m, np.asarray(profile.values)
-    beyond = np.append(density[1:], 0.0)
-    ends = np.append(np.diff(altitude) == 0.0, True) & (density > beyond)
-    levels: list[float] = []
-    for i in np.flatnonzero(ends & (density * extinction > 0.0)):
-        top, rate = altitude[i], extinction * (density[i] - beyond[i])
-        floor = altitude[i - 1] if i else 0.0
-        below = 1.0 / (2.0 * (radius + top) * rate**2)
-        while below * rate < 1.0 and below < 0.5 * (top - floor):
-            if below > FINEST * top:
-                levels.append(float(top - below))
-            below *= STEEPER
-    return levels
-
-
-@lru_cache(maxsize=16)
-def _legendre_values(degree: int) -> np.ndarray:
-    """P_l at the cosines of ``phase_node``, [node, l]."""
-    side = np.linspace(0.0, 1.0, PHASE_NODES // 2 + 1)[1:] ** 2
-    return np.polynomial.legendre.legvander(np.concatenate([[-1.0], side - 1.0, (1.0 - side)[-2::-1], [1.0]]), degree)
+        """Altitudes (m) at which rays are cut (levels.breaks)."""
+        return levels.breaks(self.atmosphere)
 
 
 def _maximum(values: list[Any]) -> Any:
@@ -449,33 +314,3 @@ def _numbers_of(profile: Any) -> list[Any]:
     if isinstance(profile, Tabulated):
         return [profile.altitude_m, profile.values]
     return [getattr(profile, f.name) for f in fields(profile)]
-
-
-@lru_cache(maxsize=64)
-def _of_asymmetry(kind: type, g: float) -> Any:
-    """One phase function for all that are equal."""
-    return kind(g)
-
-
-# Kept: of the parameters by which derivatives are asked for few move a phase function.
-@lru_cache(maxsize=64)
-def _phase_moments(phases: tuple[Any, ...], degree: int) -> np.ndarray:
-    """Legendre moments of several phase functions, [l, phase function]."""
-    columns = [moments_of(phase, degree) for phase in phases]
-    return np.column_stack(columns) if columns else np.zeros((degree + 1, 1))
-
-
-@lru_cache(maxsize=64)
-def _phase_series(phases: tuple[Any, ...], degree: int) -> np.ndarray:
-    """Their Legendre series at the cosines of phase_node."""
-    weights = (2.0 * np.arange(degree + 1) + 1.0) / (4.0 * np.pi)
-    return _legendre_values(degree) @ (weights[:, None] * _phase_moments(phases, degree))
-
-
-def _distinct(phases: list[Any]) -> tuple[list[Any], list[int]]:
-    """The phase functions that differ, and which of them is that of each channel."""
-    found: list[Any] = []
-    for phase in phases:
-        if not any(phase is other for other in found):
-            found.append(phase)
-    return found, [next(i for i, other in enumerate(found) if other is phase) for phase in phases]

@@ -28,7 +28,7 @@ from .plan_items import Item
 from .resolution import Resolution
 
 if TYPE_CHECKING:
-    from .sky import Sky
+    from .solved import Sky
 
 # Prediction and measurement may differ by this factor before it is said.
 OFF = 2.0
@@ -60,7 +60,7 @@ class Plan:
 
     def solve(self, atmosphere: Atmosphere | None = None) -> Sky:
         """The sky as planned; of another ``atmosphere`` with other values, where one is given."""
-        from .sky import Sky
+        from .solved import Sky
 
         suns = None if self.solved_suns_deg is None else tuple(np.radians(self.solved_suns_deg).tolist())
         return Sky(atmosphere or self.atmosphere, self.orders, self.tolerance, self.resolution, suns)
@@ -134,7 +134,7 @@ def error_found(made: Plan, views: Mapping[str, np.ndarray]) -> float:
     """
     from .backend import doubles
     from .bake.error import compare
-    from .sky import Sky
+    from .solved import Sky
 
     count = len(views["altitude_m"])
     sample = np.random.default_rng(0).permutation(count)[:SAMPLE]

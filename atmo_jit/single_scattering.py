@@ -28,9 +28,10 @@ from .field import Field
 from .geometry import distance_up, safe_sine
 from .grid import Grid
 from .march import Rays, march, point_along, visible_sun
-from .optics import PHASE_NODES, Optics, phase_node
+from .optics import Optics
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
+from .phase_series import PHASE_NODES, phase_node
 from .projection import add_harmonics, room, stored_harmonics
 from .quadrature import cosine_interpolation, half_circle
 from .resolution import Resolution

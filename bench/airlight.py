@@ -20,7 +20,7 @@ from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.bake.source import SourceTable
 from atmo_jit.march import NODES, march
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 FEW_NODES = 2  # plugins.airlight.NODES
 RAYS, RUNS = 1 << 15, 7

@@ -21,7 +21,7 @@ from atmo_jit import mapping
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.export import LAYOUTS, TEXELS, Options, export
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench import client
 from bench.client import View
 

@@ -52,7 +52,7 @@ class OwnSky:
     def __init__(self, atmosphere: Any, tolerance: float, resolution: Resolution | None = None) -> None:
         import drjit as dr
 
-        from atmo_jit.sky import Sky
+        from atmo_jit.solved import Sky
 
         self.sky = Sky(atmosphere, tolerance=tolerance, resolution=resolution)
         dr.sync_thread()

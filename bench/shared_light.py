@@ -28,7 +28,7 @@ class SharedLight:
     @cached_property
     def once(self) -> Any:
         """The sky of one event: made when it is first asked for, so that no method's solve pays for it."""
-        from atmo_jit.sky import Sky
+        from atmo_jit.solved import Sky
 
         return Sky(self.atmosphere, orders=1)
 

@@ -97,7 +97,7 @@ def in_process(name: str = "earth", rays: int = 200_000) -> list[Row]:
     from drjit.llvm.ad import Float
 
     import atmo_jit
-    from atmo_jit.sky import Sky
+    from atmo_jit.solved import Sky
 
     atmosphere = atmo_jit.Atmosphere.load(name)
     scattering = atmosphere.mie[0].scattering_per_m

@@ -36,7 +36,7 @@ from atmo_jit.mapping import Hillaire, texels
 from atmo_jit.needs import Needs
 from atmo_jit.phase import RayleighPhase
 from atmo_jit.plan import plan
-from atmo_jit.sky import RayLight, Sky
+from atmo_jit.solved import RayLight, Sky
 
 from .cost import timed
 

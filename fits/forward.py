@@ -20,7 +20,7 @@ from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.optics import MAX_CHANNELS
 from atmo_jit.resolution import Resolution, column_of
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 from .light import RayLight
 from .observations import Observations

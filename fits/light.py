@@ -17,7 +17,7 @@ from atmo_jit.march import NODES, Shells
 from atmo_jit.optics import MAX_CHANNELS, on_device
 from atmo_jit.recording import Recordings
 from atmo_jit.remainder import joined, parted
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 
 class RayLight:

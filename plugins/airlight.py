@@ -19,7 +19,7 @@ from atmo_jit.march import Rays, Shells, march, point_along, rays_to_boundary, v
 from atmo_jit.quadrature import gauss_legendre
 from atmo_jit.resolution import moments_of
 from atmo_jit.single_scattering import disc_cosine
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 from .exposed import number
 from .globe import Globe

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.atmosphere import Atmosphere
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 from . import albedo, bounds, settings
 from .exposed import array, first, host, single, variables

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.backend import doubles
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 from .air import Air
 from .flight import Airway, Flight, flight

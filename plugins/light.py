@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from atmo_jit.errors import InputError
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from atmo_jit.spectrum import SpectralBasis
 
 from . import settings

@@ -22,7 +22,7 @@ from atmo_jit.derivatives import PROFILE
 from atmo_jit.errors import InputError
 from atmo_jit.optics import on_device
 from atmo_jit.parameters import RADII, check_names, described, tangent
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 Changes = Mapping[str, np.ndarray]
 # Of the number that moves most, relative. Smaller, and float32 shows: pictures are known to 1e-6 or so.

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from atmo_jit.errors import AtmosphereError, InputError, shown
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 from . import settings
 from .airlight import Airlight

@@ -5,7 +5,7 @@ import pytest
 
 import atmo_jit
 from atmo_jit.backend import doubles
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 AZIMUTH = np.radians([0.0, 20.0, 75.0, 130.0, 180.0])
 VIEW = np.radians([0.0, 35.0, 70.0, 85.0, 88.0, 92.0, 100.0, 140.0, 180.0])

@@ -95,7 +95,7 @@ def test_predictions_hold_here(monkeypatch):
     constants were not fitted to. Machines that share their processor vary by half of that by themselves."""
     import drjit as dr
 
-    from atmo_jit.sky import Sky
+    from atmo_jit.solved import Sky
 
     monkeypatch.undo()
     costs.machine_factor.cache_clear()

@@ -351,7 +351,7 @@ def test_few_orders_tell_of_those_that_follow(monkeypatch):
     names = ["rayleigh.scattering_per_m", "ground_albedo", "mie.scattering_per_m"]
 
     def solved(sure):
-        monkeypatch.setattr("atmo_jit.sky.SURE", sure)
+        monkeypatch.setattr("atmo_jit.solved.SURE", sure)
         at = atmo_jit.linearize(white, views)
         return len(at.sky.solutions[0].field.shares), at.jacobian(names)
 

@@ -9,7 +9,7 @@ from tolerances import FLOAT64, PHASE_FLOAT32, PHASE_GRADIENT, PHASE_QUADRATURE,
 import atmo_jit
 from atmo_jit.backend import row_size, types
 from atmo_jit.errors import AtmosphereError
-from atmo_jit.optics import Optics, phase_node
+from atmo_jit.optics import Optics
 from atmo_jit.phase import (
     CornetteShanks,
     HenyeyGreenstein,
@@ -19,6 +19,7 @@ from atmo_jit.phase import (
     TabulatedPhase,
     phase_from_dict,
 )
+from atmo_jit.phase_series import phase_node
 
 # Corners of the table lie on panel boundaries of the quadrature below.
 TABLE = TabulatedPhase([-1.0, -0.5, 0.5, 0.75, 1.0], [0.3, 0.1, 0.4, 2.0, 9.0])

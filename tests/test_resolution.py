@@ -9,7 +9,7 @@ import atmo_jit
 from atmo_jit.backend import doubles
 from atmo_jit.phase import HenyeyGreenstein
 from atmo_jit.resolution import FIRST_DEGREES, Resolution, moments_of
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 EARTH = atmo_jit.Atmosphere.load("earth")
 

@@ -8,7 +8,7 @@ from twins import Twin
 
 import atmo_jit
 from atmo_jit.backend import doubles
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench.worlds import WORLDS, views_of, world
 
 SPEC = WORLDS["small planet"]

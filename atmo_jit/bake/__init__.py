@@ -1,7 +1,7 @@
-"""Tables that stand in for the march: constant time per look-up, filled from a solved :class:`atmo_jit.sky.Sky`.
+"""Tables that stand in for the march: constant time per look-up, filled from a solved :class:`atmo_jit.solved.Sky`.
 
 >>> from atmo_jit.bake.sky_view import SkyView
->>> from atmo_jit.sky import Sky
+>>> from atmo_jit.solved import Sky
 >>> view = SkyView(Sky("earth"), altitude_m=2.0, sun_zenith=0.9)
 >>> red, green, blue = view.radiance([0.0, 1.5], [0.0, 3.0])
 

@@ -18,7 +18,7 @@ from ..backend import floats, types
 from ..column import column_up
 from ..mapping import Bruneton, texels
 from ..phase import RayleighPhase
-from ..sky import Sky
+from ..solved import Sky
 from .mean_source import MeanSource, view_range
 from .sightlines import NODES, Sightlines
 from .sunlight import Sunlight

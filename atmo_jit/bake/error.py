@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import mapping
 from ..backend import doubles, floats
-from ..sky import Sky
+from ..solved import Sky
 from .froxels import Froxels
 from .sky_view import SkyView
 from .tables import Tables4D

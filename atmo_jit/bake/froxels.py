@@ -16,7 +16,7 @@ import numpy as np
 
 from ..backend import floats, packet, padded, parameter, types
 from ..mapping import Hillaire, texels
-from ..sky import RayLight, Sky
+from ..solved import RayLight, Sky
 from .node_light import is_peaked
 from .sightlines import Sightlines
 from .sunlight import Sunlight

@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import mapping
 from ..backend import doubles, floats
-from ..sky import Sky
+from ..solved import Sky
 from .sky_view import SkyView
 from .tables import Tables4D
 

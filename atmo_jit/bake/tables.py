@@ -23,7 +23,7 @@ from ..backend import floats, packet, padded, parameter, stored, types
 from ..mapping import texels
 from ..march import Rays, rays_to_boundary
 from ..single_scattering import ground_light
-from ..sky import RayLight, Sky
+from ..solved import RayLight, Sky
 from .mean_source import MeanSource, view_cosines
 from .node_light import NodeLight, Nodes, is_peaked
 from .sightlines import Sightlines

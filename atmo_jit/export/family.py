@@ -18,7 +18,7 @@ from ..bake.error import compare
 from ..errors import InputError
 from ..mapping import Bruneton
 from ..phase import RayleighPhase
-from ..sky import Sky
+from ..solved import Sky
 from . import bruneton, cosmoscout, takram
 from .colour import Channels, channels, described
 from .containers import File, source

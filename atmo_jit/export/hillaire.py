@@ -21,7 +21,7 @@ from ..bake.error import compare
 from ..errors import InputError
 from ..mapping import Hillaire, texels
 from ..quadrature import gauss_legendre
-from ..sky import Sky
+from ..solved import Sky
 from .colour import Channels, channels, described
 from .containers import File, exr, halved, npy
 from .exporter import Clock, Made, Options, only, refuse

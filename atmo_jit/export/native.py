@@ -19,7 +19,7 @@ from ..backend import floats
 from ..errors import InputError
 from ..files import read_npz
 from ..resolution import Resolution, Stage
-from ..sky import Sky
+from ..solved import Sky
 from .containers import npz
 from .exporter import Clock, Made, Options, refuse
 

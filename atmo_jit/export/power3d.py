@@ -23,7 +23,7 @@ from ..errors import InputError
 from ..mapping import Power3D, texels
 from ..phase import CornetteShanks, RayleighPhase
 from ..quadrature import half_circle
-from ..sky import Sky
+from ..solved import Sky
 from .colour import Channels, channels, described
 from .exporter import Clock, Made, Options, only, refuse
 from .hillaire import table_files

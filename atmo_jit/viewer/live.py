@@ -28,7 +28,7 @@ from ..export.lookup import ClientTables
 from ..export.parameters import aerosol
 from ..export.shaders import glsl
 from ..mapping import Bruneton, texels
-from ..sky import Sky
+from ..solved import Sky
 from ..spectrum import SpectralBasis
 from .controls import MU_S_MIN, changed, check, controls
 

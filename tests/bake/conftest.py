@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from atmo_jit.atmosphere import Atmosphere
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench.worlds import WORLDS
 
 

@@ -62,7 +62,7 @@ def test_texels_are_the_solution(tables, earth_sky):
 
 
 def test_black_planet_without_aerosol(earth_sky):
-    from atmo_jit.sky import Sky
+    from atmo_jit.solved import Sky
 
     bare = Sky({**earth_sky.atmosphere.to_dict(), "mie": None, "ground_albedo": 0}, orders=1)
     tables = bruneton_tables(bare, size=(4, 16, 4, 8))

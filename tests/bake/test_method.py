@@ -10,7 +10,7 @@ from atmo_jit.backend import floats
 from atmo_jit.bake import method as methods
 from atmo_jit.bake.method import plan
 from atmo_jit.bake.sky_view import SkyView
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from atmo_jit.views import check_views
 from bench.worlds import WORLDS, world
 

@@ -12,7 +12,7 @@ from atmo_jit.bake.sightlines import Sightlines, in_steps
 from atmo_jit.bake.sky_view import SkyView
 from atmo_jit.grid import Grid
 from atmo_jit.optics import Optics
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 EARTH = Atmosphere.load("earth")
 # Sun (deg) and what differs from the earth: first the same, then everything; in thicker air rays have more pieces.

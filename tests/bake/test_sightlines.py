@@ -8,7 +8,7 @@ import pytest
 from atmo_jit.backend import doubles, floats, uints
 from atmo_jit.bake.sightlines import Sightlines
 from atmo_jit.bake.sunlight import Sunlight
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 
 def views(altitude: float, sun_deg: float) -> tuple[np.ndarray, ...]:

@@ -9,7 +9,7 @@ from atmo_jit.backend import doubles, floats
 from atmo_jit.bake.error import sky_view_error, tables_error
 from atmo_jit.bake.sky_view import SkyView
 from atmo_jit.bake.tables import Size, Tables4D
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench.worlds import WORLDS
 
 

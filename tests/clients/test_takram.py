@@ -15,7 +15,7 @@ from atmo_jit.export.containers import read_exr
 from atmo_jit.export.family import client_tables
 from atmo_jit.export.lookup import packed
 from atmo_jit.export.parameters import aerosol
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench import client
 from bench.export import quantiles, truth
 

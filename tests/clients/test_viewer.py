@@ -14,7 +14,7 @@ from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.export.containers import read_exr
 from atmo_jit.image import _compressed
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from atmo_jit.spectrum import SpectralBasis
 from bench.browser import SHIFT, Browser, missing
 from bench.client import required

@@ -16,6 +16,6 @@ def takram(tmp_path_factory):
 @pytest.fixture(scope="package")
 def earth_sky():
     """The solved Earth."""
-    from atmo_jit.sky import Sky
+    from atmo_jit.solved import Sky
 
     return Sky("earth")

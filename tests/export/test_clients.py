@@ -127,7 +127,7 @@ def test_an_aerosol_that_clients_do_not_have_keeps_its_radiance(earth, tmp_path)
     assert any("2 species" in w for w in report.warnings)
     tables = read(tmp_path)
     from atmo_jit.backend import doubles
-    from atmo_jit.sky import Sky
+    from atmo_jit.solved import Sky
 
     h, mu, mu_s, nu = scattering_nodes(tables.mapping, (8, 32, 8, 16))
     at = (4, 28, 7, 15)  # a texel that looks 15 degrees past the sun, which is overhead

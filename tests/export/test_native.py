@@ -10,7 +10,7 @@ from atmo_jit.errors import InputError
 from atmo_jit.export import Options, export, read
 from atmo_jit.export.native import FILE, files
 from atmo_jit.grid import Grid
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from bench.worlds import WORLDS
 
 

@@ -13,7 +13,7 @@ from atmo_jit.export import Options, export
 from atmo_jit.export.containers import read_exr
 from atmo_jit.export.hillaire import AERIAL, multiple_scattering
 from atmo_jit.mapping import Hillaire
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from atmo_jit.backend import doubles, floats
 from atmo_jit.bake.client import SCATTERING, bruneton_tables, scattering_nodes, transmittance_up
 from atmo_jit.mapping import texels
 from atmo_jit.march import march
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 COUNT = 20000
 

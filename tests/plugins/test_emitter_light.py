@@ -12,7 +12,7 @@ from emitters import LUMINANCE, columns, looking, plane, sampled, seen, sun
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 from atmo_jit.spectrum import SpectralBasis, xyz_to_srgb
 from atmo_jit.wavelengths import at_wavelengths
 

@@ -10,7 +10,7 @@ import pytest
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.plugins.panorama import Panorama, Warp, solve_disc, solve_sky
-from atmo_jit.sky import Sky
+from atmo_jit.solved import Sky
 
 COUNT = 4000
 # Error of the interpolated radiance relative to the brightest 99.9 %: worst of these cases 0.25 % near the horizon of
