@@ -200,14 +200,15 @@ def _stored(groups: Sequence[Sequence[Any]], lane: Any, sizes: list[int]) -> lis
 
     known = noted.take(len(sizes))
     if known is None:
-        return evaluated([_scattered(values, lane, size) for values, size in zip(groups, sizes, strict=True)])
+        return evaluated([scattered(values, lane, size) for values, size in zip(groups, sizes, strict=True)])
     if not dr.grad_enabled(groups):
         return known
     zero = dr.zeros(types().Float, dr.width(lane))
     return dr.custom(_operations()[1], [[value + zero for value in values] for values in groups], lane, sizes, known)
 
 
-def _scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
+def scattered(values: Sequence[Any], lane: Any, size: int) -> Any:
+    """The same of one buffer, not evaluated."""
     import drjit as dr
 
     t = types()
@@ -331,7 +332,7 @@ def _operations() -> tuple[type, type]:
 
         def forward(self) -> None:
             steps = zip(self.grad_in("groups"), self.sizes, strict=True)
-            grads = [_scattered(values, self.lane, size) for values, size in steps]
+            grads = [scattered(values, self.lane, size) for values, size in steps]
             dr.eval(grads)
             self.set_grad_out(grads)
 

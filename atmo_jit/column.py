@@ -28,6 +28,7 @@ from .grid import Grid
 from .levels import thinnest
 from .optics import Optics
 from .profile import Exponential
+from .profile_tangents import following_profiles
 from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
@@ -169,7 +170,16 @@ def sun_columns(optics: Optics, grid: Grid, table: Any = None, known: Any = None
     SunColumns.of."""
     with dr.suspend_grad():
         columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
-    return columns.of(optics, table, known) if optics.profiles_differentiable else columns
+    if not optics.profiles_differentiable or columns.table is None:
+        return columns
+
+    def tables(other: Optics) -> list[Any]:
+        return [columns.of(other, known=known if other is optics else None).table]
+
+    if table is None:
+        owners, held = [range(len(optics.constituents))], lambda: [columns.table]
+        (table,) = following_profiles(optics, grid, "table of sun columns", owners, tables, held)
+    return columns.of(optics, table)
 
 
 def integration_rule(optics: Optics) -> tuple[Any, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import evaluated, floats, packet, padded, row, stored, types, uints
+from .backend import evaluated, floats, packet, padded, row, stored, sum_loop, types, uints
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
@@ -182,7 +182,7 @@ class Field:
         moments, phases, recurrences, degrees = (evaluated(table) for table in self._tables)
         stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
 
-        def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
+        def pair(i: Any, state: Any, sums: list[list[Any]], weights: list[list[Any]]) -> tuple[Any, ...]:
             values, state = basis.next(packet(recurrences, i, 4, active), state)
             corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
             moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
@@ -197,7 +197,7 @@ class Field:
         width = dr.width(h)
         sums = [[dr.zeros(t.Float, width) for _ in range(kinds * channels)] for _ in range(basis.count)]
         state = (t.UInt(0), basis.start(width), sums)
-        *_, sums = dr.while_loop(state, lambda i, *_: i < stride, pair, max_iterations=-1, label="scattered")
+        *_, sums = sum_loop(state, lambda i, *_: i < stride, pair, weights, "scattered")
         total = sums[0]
         if basis.slopes:
             # The directions enter the loop without derivatives, which here follow from the sums of the slopes.

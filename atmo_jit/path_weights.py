@@ -9,10 +9,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from . import noted
 from .backend import row, sum_loop, table, table_of, tables_of, types
 from .optics import Optics
 from .paths import Paths, Points, points_along
+from .profile_tangents import following_profiles
 from .quadrature import gauss_legendre, running_integral
 
 
@@ -30,14 +30,19 @@ class Columns:
 
 
 def columns_along(optics: Optics, points: Points) -> Columns:
-    """Densities and columns at the points of the paths, kept with them unless the profiles carry derivatives."""
+    """Densities and columns at the points of the paths, kept with them."""
     if not optics.constituents or not len(points.h):
         empty = dr.zeros(types().Float, 8)
         return Columns(empty, empty, empty)
-    if optics.profiles_differentiable:
-        with noted.apart():
-            return _traced_columns(optics, points)
-    return points.paths.kept(("columns", points.nodes), lambda: _columns(optics, points))
+    made = following_profiles(
+        optics,
+        points.paths,
+        ("columns", points.nodes),
+        [range(len(optics.constituents))] * 3,
+        lambda other: list(vars(_traced_columns(other, points)).values()),
+        lambda: list(vars(_columns(optics, points)).values()),
+    )
+    return Columns(*made)
 
 
 def _columns(optics: Optics, points: Points) -> Columns:

@@ -7,7 +7,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from . import noted
 from .backend import (
     floats,
     not_negative,
@@ -32,6 +31,7 @@ from .optics import Optics
 from .path_weights import PathWeights
 from .paths import Directions, Paths, paths_along
 from .phase_series import PHASE_NODES, phase_node
+from .profile_tangents import SUN, following_profiles
 from .projection import add_harmonics, room, stored_harmonics
 from .quadrature import cosine_interpolation, half_circle
 from .resolution import Resolution
@@ -55,19 +55,17 @@ class Sunbeam:
         self._lowest, self._per_step = parameter(lowest), parameter((self.COSINES - 1) / (1.0 - lowest))
         kinds = len(optics.constituents)
 
-        def beams() -> Any:
+        def beams(other: Optics) -> list[Any]:
+            toward_sun = columns if other is optics else columns.of(other)
             lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
             h = dr.gather(t.Float, paths.kept("levels", lambda: floats(paths.levels)), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
-            seen = visible_sun(optics, h, optics.radius + h, mu_s)
-            return table_of([seen, *columns.toward(h, mu_s)], lane)
+            seen = visible_sun(other, h, other.radius + h, mu_s)
+            return [table_of([seen, *toward_sun.toward(h, mu_s)], lane)]
 
-        if optics.profiles_differentiable:
-            with noted.apart():
-                held = beams()
-        else:
-            keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
-            held = keeper.kept(("sunbeams", paths.refine), beams)
+        keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
+        owners = [[SUN, *range(kinds)]]
+        (held,) = following_profiles(optics, keeper, ("sunbeams", paths.refine), owners, beams)
         lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
         seen, *column = row(held, lane, 1 + kinds)
         optics = optics.spread(dr.width(lane))
