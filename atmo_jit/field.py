@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import evaluated, floats, packet, padded, row, stored, sum_loop, types, uints
+from .backend import evaluated, floats, packet, padded, row, stored, sum_loop, together, types, uints
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
@@ -179,7 +179,10 @@ class Field:
         weights = [[w * scales[i // 2][c] for c in range(channels)] for i, w in enumerate(weights)]
         sine = safe_sine(mu)
         basis = _Harmonics(dr.detach(mu), dr.detach(sine * cos_phi), slopes=dr.grad_enabled(mu, cos_phi))
-        moments, phases, recurrences, degrees = (evaluated(table) for table in self._tables)
+        moments, phases, recurrences, degrees = self._tables
+        # Together: one kernel makes the derivatives by all that the loop reads.
+        moments, phases, *weights = together([moments, phases, *(w for of_node in weights for w in of_node)])
+        weights = [weights[i : i + channels] for i in range(0, len(weights), channels)]
         stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
 
         def pair(i: Any, state: Any, sums: list[list[Any]], weights: list[list[Any]]) -> tuple[Any, ...]:
@@ -201,6 +204,7 @@ class Field:
         total = sums[0]
         if basis.slopes:
             # The directions enter the loop without derivatives, which here follow from the sums of the slopes.
+            dr.eval(sums)
             steps = mu - basis.mu, sine * cos_phi - basis.x
             for step, slopes in zip(steps, sums[1:], strict=True):
                 total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]

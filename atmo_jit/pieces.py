@@ -12,7 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-from .backend import evaluated, row, sum_loop, table_of, types
+from ._trees import flat, like
+from .backend import evaluated, sum_loop, together, types
 from .column import SunColumns
 from .field import Field
 from .geometry import UPRIGHT, altitude_along
@@ -28,6 +29,7 @@ from .march import (
     visible_sun,
 )
 from .optics import Optics
+from .ray_sums import RaySums
 
 LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves a level too slowly to tell where
 FARTHER = 0.05  # of a piece: a step over which light changes by far more than its rounding
@@ -38,12 +40,13 @@ NOTHING = 1e-18
 
 @dataclass
 class Pieces:
-    """Pieces of rays, ray after ray: ``first`` [N + 1]: where those of each ray start. Per piece: ``ray``, ``start``
-    and ``length`` (m); ``closes``: it reaches the end of the ray. After the last come some of no length that no ray
-    has. ``rule``: rows of march.Rule by which all are integrated."""
+    """Pieces of rays, ray after ray: ``first`` [N + 1]: where those of each ray start. Per piece: ``ray``, and where
+    those of this ray ``begin``; ``start`` and ``length`` (m); ``closes``: it reaches the end of the ray. After the last
+    come some of no length that no ray has. ``rule``: rows of march.Rule by which all are integrated."""
 
     first: Any
     ray: Any
+    begin: Any
     start: Any
     length: Any
     closes: Any
@@ -92,22 +95,23 @@ class Pieces:
             total = _room(total)
             ray, start, length = dr.zeros(t.UInt, total), dr.zeros(t.Float, total), dr.zeros(t.Float, total)
             closes, before = dr.zeros(t.UInt, total), ends - counts
-            lane = dr.arange(t.UInt, width)
+            lane, begin = dr.arange(t.UInt, width), dr.arange(t.UInt, total)
 
             def store(number: Any, d: Any, end: Any) -> None:
                 place = before + number
                 dr.scatter(ray, lane, place)
+                dr.scatter(begin, before, place)
                 dr.scatter(start, d, place)
                 dr.scatter(length, end - d, place)
                 dr.scatter(closes, dr.select(end >= rays.stop, t.UInt(1), t.UInt(0)), place)
 
-            dr.eval(cut(store), ray, start, length, closes)
+            dr.eval(cut(store), ray, begin, start, length, closes)
             first = dr.zeros(t.UInt, width + 1)
             dr.scatter(first, ends, lane + 1)
             dr.eval(first)
             closes = closes > 0
             dr.eval(closes)
-        return cls(first, ray, start, length, closes, Rule(NODES).rows)
+        return cls(first, ray, begin, start, length, closes, Rule(NODES).rows)
 
 
 def light_along(
@@ -124,11 +128,12 @@ def light_along(
     if pieces is None:
         zero = [dr.zeros(t.Float, width) for _ in range(channels)]
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(channels)])
-    lane, rule = dr.arange(t.UInt, pieces.count), Rule(NODES, pieces.rule)
+    rule = Rule(NODES, pieces.rule)
     full = dr.zeros(t.Float, width)
     per_ray, optics = optics.spread(width), optics.spread(pieces.count)
-    members = [evaluated(v + full) for v in (rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop)]
-    h, mu, mu_s, nu, stop = (dr.gather(t.Float, v, pieces.ray) for v in members)
+    along = RaySums(pieces.first, pieces.ray, pieces.begin)
+    members = evaluated([v + full for v in (rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop)])
+    h, mu, mu_s, nu, stop = along.at_pieces(members)
     here, start = Rays(h, mu, mu_s, nu, stop, pieces.closes), pieces.start
     length = dr.select(pieces.closes, stop - start, pieces.length)
     if dr.grad_enabled(h, mu):
@@ -138,8 +143,8 @@ def light_along(
     density = [
         optics.densities(altitude_along(optics.radius, h, mu, dr.fma(length, x, start))[0]) for x in rule.few_x
     ]
-    own = table_of([length * rule.sum(rule.few_w, density, k) for k in range(kinds)], lane)
-    amounts = _sums(own, dr.gather(t.UInt, pieces.first, pieces.ray), lane, kinds)
+    own = evaluated([length * rule.sum(rule.few_w, density, k) for k in range(kinds)])
+    amounts = along.before(own)
     phases = {k: optics.phase_values(k, nu) for k in optics.scatterers}
     scatterers = optics.scatterers
 
@@ -168,6 +173,7 @@ def light_along(
     zeros = [dr.zeros(t.Float, pieces.count) for _ in range(channels * (1 + len(scatterers)) + 2)]
     state = (t.UInt(0), zeros[:channels], zeros[channels:-2], zeros[-2], zeros[-1])
     given = [optics.used, vars(here), phases, density, amounts, length, start]
+    given = like(given, together(flat(given)))  # by all of them in one kernel: each would run the loop once more
     _, one, weight, centroid, total = sum_loop(state, lambda g, *_: g < rule.count, node, given, "nodes apart")
     more = [dr.zeros(t.Float, pieces.count) for _ in range(channels)]
     if source is not None:
@@ -180,14 +186,11 @@ def light_along(
         for n in range(len(scatterers)):
             for c in range(channels):
                 more[c] = dr.fma(weight[n * channels + c], dr.maximum(toward[n * channels + c], 0.0), more[c])
-    ray = dr.arange(t.UInt, width)
-    bounds = [dr.gather(t.UInt, pieces.first, ray + i) for i in (0, 1)]
-    sums = _sums(table_of([*one, *more], lane), *bounds, 2 * channels)
-    depths = per_ray.optical_depths(_sums(evaluated(own), *bounds, kinds))
+    sums = along.totals([*one, *more, *own])
     return Light(
         [radiance * solar for radiance, solar in zip(sums[:channels], per_ray.solar, strict=True)],
-        sums[channels:],
-        [dr.exp(-depth) for depth in depths],
+        sums[channels : 2 * channels],
+        [dr.exp(-depth) for depth in per_ray.optical_depths(sums[2 * channels :])],
     )
 
 
@@ -236,14 +239,3 @@ def _room(count: int) -> int:
     """Pieces for which there is room: sizes that seldom change between atmospheres, so that recordings serve."""
     step = 1 << max(count.bit_length() - 4, 4)
     return -(-count // step) * step
-
-
-def _sums(table: Any, start: Any, stop: Any, count: int) -> list[Any]:
-    """Sums of the rows from ``start`` to ``stop`` of a table of rows of ``count``."""
-    t = types()
-
-    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        return i + 1, [s + v for s, v in zip(sums, row(table, i, count), strict=True)]
-
-    zero = [dr.zeros(t.Float, dr.width(stop)) for _ in range(count)]
-    return dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="sum of rows")[1]
