@@ -22,13 +22,14 @@ import drjit as dr
 import numpy as np
 
 from . import noted
-from .backend import floats, packet, parameter, row, sum_loop, table_of, types
+from ._trees import flat
+from .backend import Keeper, floats, packet, parameter, row, sum_loop, table_of, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
 from .levels import thinnest
 from .optics import Optics
 from .profile import Exponential
-from .profile_tangents import following_profiles
+from .profile_tangents import Part, few_numbers, tangents
 from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
@@ -60,13 +61,14 @@ class SunColumns:
         self._bounds, self._cells = floats(bounds), floats(bounds[np.clip(cell_start, 0, self._shells - 1)])
         self._per_metre = parameter(1.0 / atmosphere.thickness_m)
         self._rule = integration_rule(optics)
+        self._tangents: tuple[list[Part], Any] | None = None
         self.table = table if table is not None else self._build() if self._count else None
 
     def of(self, optics: Optics, table: Any = None, known: Any = None) -> SunColumns:
         """The table for other optics with profiles of the same kind, cut at the same altitudes; ``table``: its
         numbers, which carry derivatives, ``known``: which do not, where they are known already."""
         other = copy(self)
-        other.optics = optics
+        other.optics, other._tangents = optics, None
         other.table = table if table is not None else other._build(known) if self._count else None
         return other
 
@@ -99,8 +101,22 @@ class SunColumns:
         with noted.knowing([known]):
             return table_of([slope * mean for slope, mean in zip(slopes, means, strict=True)], lane)
 
-    def toward(self, h: Any, mu: Any, active: Any = True) -> list[Any]:
+    def following(self, optics: Optics, keeper: Keeper) -> SunColumns:
+        """The same for optics whose profiles, of few numbers, carry derivatives: look-ups then do. ``keeper``, which is
+        for these profiles alone, keeps the derivatives of the table."""
+
+        def make() -> tuple[list[Part], Any]:
+            parts = tangents(optics, [range(self._count)], lambda other: [self.of(other).table])
+            return parts, table_of([p.values for p in parts], dr.arange(types().UInt, dr.width(parts[0].values)))
+
+        other = self.of(optics, self.table)
+        other._tangents = keeper.kept("tangents of sun columns", make)
+        return other
+
+    def toward(self, h: Any, mu: Any, active: Any = True, optics: Optics | None = None) -> list[Any]:
         """Column density (m) of every constituent from altitude ``h`` to the top in direction ``mu`` of either sign.
+
+        ``optics``: whose profiles' derivatives it carries, where these are spread over lanes.
 
         A ray that would pass below the ground is lifted to its horizon, the ray that grazes the ground: while the
         sun's centre is below the horizon, the part of the disc still seen is there.
@@ -109,17 +125,17 @@ class SunColumns:
             return []
         radius = self.optics.radius
         mu = dr.maximum(mu, -dr.safe_sqrt(h * (2.0 * radius + h)) / (radius + h))
-        up = self._rising(h, dr.abs(mu), active)
+        up = self._rising(h, dr.abs(mu), active, optics)
         sinks = active & (mu < 0.0)
         lowest = dr.maximum(perigee_altitude(radius, h, mu), 0.0)
-        whole = self._rising(lowest, 0.0, sinks)
+        whole = self._rising(lowest, 0.0, sinks, optics)
         return [dr.select(mu < 0.0, dr.maximum(2.0 * w - u, u), u) for u, w in zip(up, whole, strict=True)]
 
-    def upward(self, h: Any) -> list[Any]:
-        """Column density (m) of every constituent straight up from altitude ``h``."""
-        return self._rising(h, 1.0, True) if self._count else []
+    def upward(self, h: Any, optics: Optics | None = None) -> list[Any]:
+        """Column density (m) of every constituent straight up from altitude ``h``; ``optics``: see toward."""
+        return self._rising(h, 1.0, True, optics) if self._count else []
 
-    def _rising(self, h: Any, mu: Any, active: Any) -> list[Any]:
+    def _rising(self, h: Any, mu: Any, active: Any, optics: Optics | None) -> list[Any]:
         """Columns to the top from ``h`` along mu >= 0; a number for it is 0.0 or 1.0, an edge of the table."""
         t = types()
         cosines = self._cosines
@@ -132,18 +148,22 @@ class SunColumns:
         below = dr.minimum(t.UInt(y), self._rows - 1)
         start = t.Float(below)
         by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
-        corner, n = dr.fma(shell, self._rows + 1, below) * cosines, self._count
+        corner = dr.fma(shell, self._rows + 1, below) * cosines
         if isinstance(mu, float):
             corner += 0 if mu == 0.0 else cosines - 1
-            near, far = (row(self.table, corner + offset, n, active=active) for offset in (0, cosines))
+            fx = None
         else:
             x = dr.log(1.0 + mu / self._knee) / self._log_range * (cosines - 1)
             column = dr.minimum(t.UInt(x), cosines - 2)
-            fx = x - t.Float(column)
-            a, b, c, d = (
-                row(self.table, corner + column + offset, n, active=active) for offset in (0, 1, cosines, cosines + 1)
-            )
-            near, far = ([dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in ((a, b), (c, d)))
+            corner, fx = corner + column, x - t.Float(column)
+
+        def rows(table: Any, count: int) -> list[list[Any]]:
+            """Those of a table at the altitudes before and after."""
+            if fx is None:
+                return [row(table, corner + offset, count, active=active) for offset in (0, cosines)]
+            pairs = [[row(table, corner + o + i, count, active=active) for i in (0, 1)] for o in (0, cosines)]
+            return [[dr.lerp(v, w, fx) for v, w in zip(*pair, strict=True)] for pair in pairs]
+
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         if not all(self._logarithmic):
             # x under the break is sqrt(bend + x^2) - sqrt(bend) away from it, in units of a horizontal ray's first row.
@@ -156,12 +176,25 @@ class SunColumns:
             step = dr.sqrt(2.0 * r / per_width) * (dr.fma(2.0, start, 1.0) / self._rows)
             nearer = dr.maximum(dr.fma(-step, by_altitude / above, path), 0.0)
             farther = dr.fma(step, (1.0 - by_altitude) / beneath, path)
+        near, far = rows(self.table, self._count)
         result = []
-        for k in range(n):
+        for k in range(self._count):
             if self._logarithmic[k]:
                 result.append(dr.exp(dr.lerp(near[k], far[k], by_altitude)) * path)
             else:
                 result.append(dr.lerp(near[k] * nearer, far[k] * farther, by_distance))
+        numbers = flat((optics or self.optics).profiles)
+        if self._tangents is None or not dr.grad_enabled(numbers):
+            return result
+        parts, table = self._tangents
+        for part, *ends in zip(parts, *rows(table, len(parts)), strict=True):
+            number, k = numbers[part.number], part.column
+            near, far = (dr.detach(end) for end in ends)
+            if self._logarithmic[k]:
+                slope = dr.lerp(near, far, by_altitude) * result[k]
+            else:
+                slope = dr.lerp(near * nearer, far * farther, by_distance)
+            result[k] = dr.fma(number - dr.detach(number), dr.detach(slope), result[k])
         return result
 
 
@@ -172,14 +205,7 @@ def sun_columns(optics: Optics, grid: Grid, table: Any = None, known: Any = None
         columns = grid.kept("sun columns", lambda: SunColumns(optics, grid.resolution.columns))
     if not optics.profiles_differentiable or columns.table is None:
         return columns
-
-    def tables(other: Optics) -> list[Any]:
-        return [columns.of(other, known=known if other is optics else None).table]
-
-    if table is None:
-        owners, held = [range(len(optics.constituents))], lambda: [columns.table]
-        (table,) = following_profiles(optics, grid, "table of sun columns", owners, tables, held)
-    return columns.of(optics, table)
+    return columns.following(optics, grid) if few_numbers(optics) else columns.of(optics, table, known)
 
 
 def integration_rule(optics: Optics) -> tuple[Any, Any]:

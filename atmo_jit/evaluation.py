@@ -11,6 +11,7 @@ import numpy as np
 from ._trees import flat, like
 from .backend import doubles, evaluated, traversing, types
 from .parameters import VIEWS
+from .profile_tangents import few_numbers
 from .recording import Recordings, copied
 from .solved import Sky
 
@@ -48,7 +49,9 @@ class Evaluation:
         them the weights, W Floats [N] by output."""
         values, views, pieces, solved, weights, of_values, of_views = arguments
         key = (tuple(weights), *of_values, *of_views)
-        by_columns = "profiles" in of_values and all(band["columns"] is not None for band in solved)
+        # Look-ups of columns carry the derivatives by few numbers of profiles, their table those by many.
+        many = not all(few_numbers(band.optics) for band in self._sky.solutions)
+        by_columns = "profiles" in of_values and many and all(band["columns"] is not None for band in solved)
 
         def leaves(values: Any, solved: Any) -> tuple[Any, Any]:
             tables = [band["columns"] for band in solved]

@@ -162,7 +162,8 @@ class Field:
                 [dr.log(dr.maximum(guide[c] * dr.lerp(values[0][c], values[1][c], fs), 1e-37)) for c in channels]
             )
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
-        above = self.optics.spread(dr.width(h)).scattering_depths(self.columns.upward(h))
+        optics = self.optics.spread(dr.width(h))
+        above = optics.scattering_depths(self.columns.upward(h, optics))
         return [dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:

@@ -156,7 +156,7 @@ def light_along(
         inside = [dr.fma(length, rule.sum(running, density, k), amounts[k]) for k in range(kinds)]
         seen = [dr.exp(-depth) * (length * w) for depth in local.optical_depths(inside)]
         there = local.densities(altitude)
-        sun_depths = local.optical_depths(columns.toward(altitude, sun))
+        sun_depths = local.optical_depths(columns.toward(altitude, sun, optics=local))
         fraction = visible_sun(local, altitude, r, sun)
         lit = [s * dr.exp(-depth) * fraction for s, depth in zip(seen, sun_depths, strict=True)]
         one, weight = list(one), list(weight)

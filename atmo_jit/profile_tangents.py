@@ -58,7 +58,7 @@ def following_profiles(
         tables = keeper.kept(key, first or (lambda: make(optics)))
     if not optics.profiles_differentiable:
         return tables
-    parts = keeper.kept(("tangents", key), lambda: _tangents(optics, owners, make))
+    parts = keeper.kept(("tangents", key), lambda: tangents(optics, owners, make))
     sizes = [row_size(len(columns)) for columns in owners]
     return dr.custom(_operation(), _numbers(optics), tables, sizes, parts)
 
@@ -67,8 +67,11 @@ def _numbers(optics: Optics) -> list[Any]:
     return [number for numbers in (*optics.profiles, [optics.sun_radius]) for number in numbers]
 
 
-def _tangents(optics: Optics, owners: Sequence[Sequence[int]], make: Callable[[Optics], list[Any]]) -> list[Part]:
-    """One column has one owner: so one step of a number of every profile serves all columns."""
+def tangents(optics: Optics, owners: Sequence[Sequence[int]], make: Callable[[Optics], list[Any]]) -> list[Part]:
+    """Derivatives of the tables: see following_profiles.
+
+    One column has one owner: so one step of a number of every profile serves all columns.
+    """
     t = types()
     given = [*optics.profiles, [optics.sun_radius]]
     first = [sum(len(group) for group in given[:k]) for k in range(len(given))]

@@ -56,12 +56,11 @@ class Sunbeam:
         kinds = len(optics.constituents)
 
         def beams(other: Optics) -> list[Any]:
-            toward_sun = columns if other is optics else columns.of(other)
             lane = dr.arange(t.UInt, len(paths.levels) * self.COSINES)
             h = dr.gather(t.Float, paths.kept("levels", lambda: floats(paths.levels)), lane // self.COSINES)
             mu_s = dr.minimum(dr.fma(t.Float(lane % self.COSINES), 1.0 / self._per_step, self._lowest), 1.0)
             seen = visible_sun(other, h, other.radius + h, mu_s)
-            return [table_of([seen, *toward_sun.toward(h, mu_s)], lane)]
+            return [table_of([seen, *columns.toward(h, mu_s, optics=other)], lane)]
 
         keeper = paths if len(paths.levels) > len(paths.grid.levels_at(paths.refine)) else paths.grid
         owners = [[SUN, *range(kinds)]]
@@ -251,7 +250,9 @@ def sun_irradiance(optics: Optics, columns: SunColumns, h: Any, mu_s: Any) -> li
     """Irradiance of direct sunlight on a horizontal surface facing up at altitude ``h``, per channel."""
     optics = optics.spread(dr.width(h, mu_s))
     cosine = disc_cosine(mu_s, optics.sun_radius)
-    depths = optics.optical_depths(columns.toward(h, mu_s)) if optics.constituents else [0.0] * optics.channel_count
+    depths = [0.0] * optics.channel_count
+    if optics.constituents:
+        depths = optics.optical_depths(columns.toward(h, mu_s, optics=optics))
     return [solar * cosine * dr.exp(-depth) for solar, depth in zip(optics.solar, depths, strict=True)]
 
 

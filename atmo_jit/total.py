@@ -234,7 +234,7 @@ def parity(grid: Grid, degree: int) -> Any:
 def _per_depth(optics: Optics, columns: SunColumns, grid: Grid) -> Any:
     """1 / scattering depth of the air above, table [K, channels]; 0 where there is none."""
     optics = optics.spread(grid.shape[0])
-    above = optics.scattering_depths(columns.upward(grid.kept("altitudes", lambda: floats(grid.h))))
+    above = optics.scattering_depths(columns.upward(grid.kept("altitudes", lambda: floats(grid.h)), optics))
     inverse = [dr.select(d > NOTHING, 1.0 / dr.select(d > NOTHING, d, 1.0), 0.0) for d in above]
     return table_of(inverse, dr.arange(types().UInt, grid.shape[0]))
 
