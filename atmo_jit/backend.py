@@ -96,13 +96,17 @@ def parameter(value: Any) -> Any:
     return dr.opaque(t.Float, float(value), 1)
 
 
-def packet(buffer: Any, index: Any, count: int, active: Any = True, *, alone: bool = False) -> list[Any]:
+def packet(
+    buffer: Any, index: Any, count: int, active: Any = True, *, alone: bool = False, once: bool = False
+) -> list[Any]:
     """``count`` consecutive values of a Float or UInt ``buffer`` from ``index * count`` on, as a list: packet loads
     where the count is a power of two. Other counts are slow to run, and slower to compile. ``alone``: nothing else
-    reads the buffer; each thread then sums its derivatives for itself."""
+    reads the buffer; each thread then sums its derivatives for itself. ``once``: nor does a lane read what another
+    does; there is nothing to sum."""
     import drjit as dr
 
     t, mode = types(), dr.ReduceMode.Expand if alone else dr.ReduceMode.Auto
+    mode = dr.ReduceMode.NoConflicts if once else mode
     one, several = (t.UInt, t.ArrayXu) if isinstance(buffer, t.UInt) else (t.Float, t.ArrayXf)
     if count == 1:
         return [dr.gather(one, buffer, index, active, mode=mode)]
@@ -144,17 +148,17 @@ def row_size(count: int) -> int:
 
 
 def row(
-    buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True, *, alone: bool = False
+    buffer: Any, index: Any, count: int, length: int | None = None, active: Any = True, **readers: bool
 ) -> list[Any]:
-    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``); ``alone``: see
-    packet."""
+    """The first ``count`` values of row ``index`` of a table of rows of ``length`` (default: ``count``); ``readers``:
+    see packet."""
     size = row_size(length or count)
     step = min(size, 8)
-    parts = [packet(buffer, index * (size // step) + i, step, active, alone=alone) for i in range(count // step)]
+    parts = [packet(buffer, index * (size // step) + i, step, active, **readers) for i in range(count // step)]
     done = count - count % step
     if done < count:
         last = row_size(count - done)
-        parts.append(packet(buffer, index * (size // last) + done // last, last, active, alone=alone))
+        parts.append(packet(buffer, index * (size // last) + done // last, last, active, **readers))
     return [value for part in parts for value in part][:count]
 
 

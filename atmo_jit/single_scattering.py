@@ -66,7 +66,7 @@ class Sunbeam:
         owners = [[SUN, *range(kinds)]]
         (held,) = following_profiles(optics, keeper, ("sunbeams", paths.refine), owners, beams)
         lane = dr.arange(t.UInt, dr.width(held) // row_size(1 + kinds))
-        seen, *column = row(held, lane, 1 + kinds)
+        seen, *column = row(held, lane, 1 + kinds, once=True)
         optics = optics.spread(dr.width(lane))
         depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
         light = [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)]
@@ -156,7 +156,7 @@ def azimuths_together(azimuths: int) -> int:
 def azimuth_rows(buffer: Any, node: Any, group: Any, azimuths: int, width: int) -> list[list[Any]]:
     """Rows [width] of a group of azimuths of a table that ``beam_along`` made, for rays and suns ``node``."""
     together = azimuths_together(azimuths)
-    values = row(buffer, node * (azimuths // together) + group, together * width)
+    values = row(buffer, node * (azimuths // together) + group, together * width, once=True)
     return [values[i * width : (i + 1) * width] for i in range(together)]
 
 
