@@ -173,24 +173,27 @@ class Linearization:
                 found[name] = self._pulled_back(name, steps[name], host)
         return found
 
-    def _steps(self, name: str) -> list[list[Any]]:
-        """How the numbers of every band change with a parameter, as lists of leaves.
+    def _steps(self, name: str) -> list[dict[int, Any]]:
+        """How the numbers of every band change with a parameter: those leaves that do, by their places.
 
         Channels do not mix between a parameter and the numbers, nor do nodes of a profile: one step of all of them
         serves each.
         """
         along = np.ones_like(described(self.atmosphere, name))
-        return [tangent(optics, name, along, self._degrees, self._phase_degree) for optics in self._optics]
+        bands = [tangent(optics, name, along, self._degrees, self._phase_degree) for optics in self._optics]
+        return [{place: step for place, step in enumerate(steps) if np.any(step)} for steps in bands]
 
-    def _pulled_back(self, name: str, of_bands: list[list[Any]], adjoints: list[list[Any]]) -> np.ndarray:
+    def _pulled_back(self, name: str, of_bands: list[dict[int, Any]], adjoints: list[list[Any]]) -> np.ndarray:
         """Derivative by a parameter, from how the numbers of every band change with it and the derivatives by those."""
         value = described(self.atmosphere, name)
         nodes, each = ".profile." in name, per_wavelength(self.atmosphere, name)
         found = np.zeros(np.shape(value))
         for optics, channels, steps, adjoint in zip(self._optics, self._channels, of_bands, adjoints, strict=True):
-            for channel, step, grad in zip(channels, steps, adjoint, strict=True):
-                if grad is None or not np.any(step):
+            for place, step in steps.items():
+                channel, grad = channels[place], adjoint[place]
+                if grad is None:
                     continue
+                grad = grad.numpy()
                 # Rows of a table may be longer on the device.
                 product = step * (grad.reshape(len(step), -1)[:, : step.shape[1]] if np.ndim(step) == 2 else grad)
                 if nodes:
@@ -349,8 +352,7 @@ def _leaves(numbers: dict[str, Any], adjoint: dict[str, Any]) -> list[Any]:
     """Derivatives by all ``numbers`` of a band, given those by some groups of them; None: there is none."""
     found: list[Any] = []
     for group, part in numbers.items():
-        leaves = flat(adjoint.get(group, part))
-        found += [leaf.numpy() for leaf in leaves] if group in adjoint else [None] * len(leaves)
+        found += flat(adjoint[group]) if group in adjoint else [None] * len(flat(part))
     return found
 
 
