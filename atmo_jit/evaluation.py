@@ -58,24 +58,33 @@ class Evaluation:
             return _named(values, of_values), [type(table)(table) for table in tables] if by_columns else tables
 
         def of_field(values: Any, views: Any, pieces: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
-            """Derivatives by values, columns, views, and the light of the orders."""
+            """Derivatives by values, columns, views, and the light of order 1 and of the later ones."""
             values, views = copied(values), copied(views)
             own, tables = leaves(values, solved)
             orders = copied([band["orders"] for band in solved])
-            lights = [v for band in orders for v in (band["first"], *band["later"])] if of_values else []
-            wanted = own, tables if by_columns else [], {name: views[name] for name in of_views}, lights
+            lights = [[band[name] for band in orders] if of_values else [] for name in ("first", "later")]
+            wanted = own, tables if by_columns else [], {name: views[name] for name in of_views}, *lights
             dr.enable_grad(wanted)
             sky = self._sky.again(values, [band["shares"] for band in solved], tables, orders)
             return _pulled_back(self._outputs(sky, views, pieces, tuple(weights)), flat(weights), wanted)
 
-        def of_orders(values: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
-            """Derivatives by values and columns, of the light of the orders."""
+        def of_later(values: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
+            """Derivatives by values, columns and order 1, of the light of the later orders."""
+            values, first = copied(values), copied([band["known"]["first"] for band in solved])
+            own, tables = leaves(values, solved)
+            wanted = own, tables if by_columns else [], first
+            dr.enable_grad(wanted)
+            orders = self._orders(values, solved, tables, first)
+            return _pulled_back(flat([band["later"] for band in orders]), flat(weights), wanted)
+
+        def of_first(values: Any, solved: Any, weights: Any) -> tuple[Any, ...]:
+            """Derivatives by values and columns, of the light of order 1."""
             values = copied(values)
             own, tables = leaves(values, solved)
             wanted = own, tables if by_columns else []
             dr.enable_grad(wanted)
-            orders = self._orders(values, solved, tables)
-            return _pulled_back([v for band in orders for v in (band["first"], *band["later"])], weights, wanted)
+            light = self._sky.first_again(values, tables, [band["known"] for band in solved])
+            return _pulled_back(light, weights, wanted)
 
         def of_columns(values: Any, known: Any, weights: Any) -> Any:
             """Derivatives by values, of the columns."""
@@ -86,16 +95,19 @@ class Evaluation:
 
         # Several recordings: what one needs in between is free when it has been played.
         small = [{**band, "known": None, "orders": _orders_of(band["known"])} for band in solved]
-        found, tables, by_views, lights = self._run(
+        found, tables, by_views, first, later = self._run(
             ("reverse", *key), of_field, values, views, pieces, small, weights
         )
         if of_values:
-            more, again = self._run(("orders", *of_values), of_orders, values, solved, lights)
-            found = _sum(found, more)
+            sums = [found, tables]
+            if flat(later):
+                *more, again = self._run(("later", *of_values), of_later, values, solved, later)
+                sums, first = _sum(sums, more), _sum(first, again)
+            small = [{**band, "known": {"of_first": band["known"]["of_first"]}} for band in solved]
+            found, tables = _sum(sums, list(self._run(("first", *of_values), of_first, values, small, first)))
             if by_columns:
                 known = [band["columns"] for band in solved]
-                weights = _sum(tables, again)
-                found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, weights))
+                found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, tables))
         return found, by_views
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -111,9 +123,11 @@ class Evaluation:
         zero = dr.zeros(types().Float, dr.width(place[0]))
         return _wanted(wanted, light.radiance, light.transmittance, *horizontal, zero)
 
-    def _orders(self, values: list[Any], solved: list[Any], columns: list[Any]) -> list[dict[str, Any]]:
+    def _orders(
+        self, values: list[Any], solved: list[Any], columns: list[Any], first: list[Any] | None = None
+    ) -> list[dict[str, Any]]:
         shares, known = ([band[name] for band in solved] for name in ("shares", "known"))
-        return self._sky.orders_again(values, shares, columns, known)
+        return self._sky.orders_again(values, shares, columns, known, first)
 
     def _again(self, values: list[Any], solved: list[Any]) -> Sky:
         columns = self._sky.columns_again(values, [band["columns"] for band in solved])

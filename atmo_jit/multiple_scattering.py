@@ -89,10 +89,18 @@ def solve(
         shares[-1] = {**tail, "shares": shares[-1]}
     field = _field(optics, columns, grid, resolution, done["reference"], parts, shares, orders)
     if noting:
-        field.known = {"reference": done["reference"], "first": done["first"], "later": later}
+        field.known = {name: done[name] for name in ("reference", "first", "of_first")} | {"later": later}
         field.known["tables"] = [table for some in tables for table in some]
         field.known["finishing"] = finishing
     return field
+
+
+def first_again(
+    optics: Optics, columns: SunColumns, grid: Grid, resolution: Resolution, known: dict[str, Any] | None
+) -> Any:
+    """The light of order 1 for values of the optics that carry derivatives. ``known``: see orders_again."""
+    values = optics.values(resolution.degrees, resolution.phase_degree)
+    return _Steps(optics, columns, grid, resolution).first(values, known)
 
 
 def orders_again(
@@ -102,13 +110,14 @@ def orders_again(
     resolution: Resolution,
     shares: list[Any],
     known: dict[str, Any] | None,
+    first: Any,
 ) -> dict[str, Any]:
     """The light of the orders that ``shares`` count, as solve_again takes it, for values of the optics that carry
-    derivatives. ``known``: what a solve for these very values found (Field.known). Nothing in here waits for a
-    result."""
+    derivatives. ``known``: what a solve for these very values found (Field.known); ``first``: the light of order 1.
+    Nothing in here waits for a result."""
     steps = _Steps(optics, columns, grid, resolution)
     values = optics.values(resolution.degrees, resolution.phase_degree)
-    started = steps.started(values, len(shares) + 1, known, parted(shares)[1])
+    started = steps.started(values, first, len(shares) + 1, known, parted(shares)[1])
     return {**started, "finishing": known["finishing"]} if known else started
 
 
@@ -193,9 +202,11 @@ class _Steps:
         """Orders 1 to ``count``, the reference, what the next order needs, and all tables if they are noted."""
 
         def start(values: Any) -> dict[str, Any]:
+            with noted.noting() as of_first:
+                first = self.first(values)
             with noted.noting() as tables:
-                done = self.started(values, count)
-            return {**done, "tables": tables if noting else []}
+                done = self.started(values, first, count)
+            return {**done, "of_first": of_first if noting else [], "tables": tables if noting else []}
 
         return self._run(("start", count, noting), start, values)
 
@@ -275,22 +286,35 @@ class _Steps:
         r = self._resolution
         return (r.first_degree,) * 2 if n == 1 else (r.stages[self._stage(n)].degree, r.stages[self._stage(n)].most)
 
+    def first(self, values: Any, known: dict[str, Any] | None = None) -> Any:
+        """The light of order 1, traced."""
+        optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
+        fine = directions_at(grid, r.first_up, r.first_down)
+        project = Projection.at(grid, fine, *self._degree(1))
+        with noted.knowing(known and known["of_first"]):
+            light = first_order(optics, self._columns, grid, fine, r)
+            return project(light, len(grid.first_theta), optics.channel_count).values
+
     def started(
-        self, values: Any, count: int, known: dict[str, Any] | None = None, tail: dict[str, Any] | None = None
+        self,
+        values: Any,
+        first: Any,
+        count: int,
+        known: dict[str, Any] | None = None,
+        tail: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """The same, traced; with a ``tail``, what Remainder holds, the last of the ``count`` is all that follow."""
+        """The same from order 1, traced; with a ``tail``, what Remainder holds, the last of the ``count`` is all that
+        follow."""
         if known is None:
-            return self._started(values, count, None, tail, None)
+            return self._started(values, first, count, None, tail, None)
         with noted.knowing(known["tables"]):
-            return self._started(values, count, known["reference"], tail, tail and known["later"][-1])
+            return self._started(values, first, count, known["reference"], tail, tail and known["later"][-1])
 
     def _started(
-        self, values: Any, count: int, held: dict[str, Any] | None, tail: dict[str, Any] | None, rest: Any
+        self, values: Any, first: Any, count: int, held: dict[str, Any] | None, tail: dict[str, Any] | None, rest: Any
     ) -> dict[str, Any]:
-        optics, grid, r = self._optics.with_values(values), self._grid, self._resolution
-        suns, fine = len(grid.first_theta), directions_at(grid, r.first_up, r.first_down)
-        project = Projection.at(grid, fine, *self._degree(1))
-        first = project(first_order(optics, self._columns, grid, fine, r), suns, optics.channel_count)
+        optics, grid = self._optics.with_values(values), self._grid
+        first = Moments(first, *self._degree(1), len(grid.first_theta), optics.channel_count)
         with noted.apart():
             reference = Reference.above(grid, first) if held is None else Reference.of(grid, first.channels, held)
         later, light, gather = [], first, None

@@ -20,8 +20,12 @@ def noting() -> Iterator[list[Any]]:
 
 
 @contextmanager
-def knowing(tables: list[Any]) -> Iterator[None]:
-    """In this block ``tables``, noted in another of the same steps, take the place of what they would evaluate."""
+def knowing(tables: list[Any] | None) -> Iterator[None]:
+    """In this block ``tables``, noted in another of the same steps, take the place of what they would evaluate; None:
+    nothing is known here."""
+    if tables is None:
+        yield
+        return
     with _instead(None, list(tables)):
         yield
         if _known:

@@ -23,7 +23,7 @@ from .errors import InputError
 from .field import Field
 from .grid import Grid
 from .march import Rays, Shells, march
-from .multiple_scattering import orders_again, solve, solve_again
+from .multiple_scattering import first_again, orders_again, solve, solve_again
 from .optics import MAX_CHANNELS, Optics
 from .pieces import Pieces, light_along
 from .resolution import Resolution
@@ -125,21 +125,34 @@ class Sky:
             tables.append(sun_columns(optics, self.grid, known=known[i] if known else None).table)
         return tables
 
+    def first_again(
+        self, values: list[dict[str, Any]], columns: list[Any], known: list[dict[str, Any] | None] | None = None
+    ) -> list[Any]:
+        """The light of order 1, per band; ``columns``, ``known``: see orders_again."""
+        lights = []
+        for i, (band, new) in enumerate(zip(self._bands, values, strict=True)):
+            optics, grid = band.optics.with_values(new), self.grid
+            toward_sun = sun_columns(optics, grid, columns[i])
+            lights.append(first_again(optics, toward_sun, grid, self.resolution, known and known[i]))
+        return lights
+
     def orders_again(
         self,
         values: list[dict[str, Any]],
         shares: list[Any],
         columns: list[Any],
         known: list[dict[str, Any] | None] | None = None,
+        first: list[Any] | None = None,
     ) -> list[dict[str, Any]]:
         """The light of the orders for other ``values``, which may carry derivatives, as many as there are ``shares``;
-        ``columns``: see columns_again; ``known`` (Field): from a solve for these values."""
+        ``columns``: see columns_again; ``known`` (Field): from a solve for these values; ``first``: see first_again."""
+        first = first or self.first_again(values, columns, known)
         done = []
         for i, (band, new) in enumerate(zip(self._bands, values, strict=True)):
             optics, grid = band.optics.with_values(new), self.grid
             toward_sun = sun_columns(optics, grid, columns[i])
             of_solve = known and known[i]
-            done.append(orders_again(optics, toward_sun, grid, self.resolution, shares[i], of_solve))
+            done.append(orders_again(optics, toward_sun, grid, self.resolution, shares[i], of_solve, first[i]))
         return done
 
     def again(

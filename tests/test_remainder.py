@@ -42,7 +42,7 @@ def equation(sky):
     steps = _Steps(band.optics, band.columns, sky.grid, sky.resolution)
     values = band.optics.values(sky.resolution.degrees, sky.resolution.phase_degree)
     count = len(known["later"])
-    done = steps.started(values, count)
+    done = steps.started(values, steps.first(values), count)
     gather = steps._gather(band.optics, band.field.reference, count + 1, done["gather"])
     return Remainder(gather, steps._project(count + 1), tail), *known["later"][-2:]
 
