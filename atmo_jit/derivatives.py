@@ -181,7 +181,7 @@ class Linearization:
         """
         along = np.ones_like(described(self.atmosphere, name))
         bands = [tangent(optics, name, along, self._degrees, self._phase_degree) for optics in self._optics]
-        return [{place: step for place, step in enumerate(steps) if np.any(step)} for steps in bands]
+        return [{place: step for place, step in enumerate(steps) if _any(step)} for steps in bands]
 
     def _pulled_back(self, name: str, of_bands: list[dict[int, Any]], adjoints: list[list[Any]]) -> np.ndarray:
         """Derivative by a parameter, from how the numbers of every band change with it and the derivatives by those."""
@@ -346,6 +346,11 @@ class Linearization:
         outputs, changes = evaluation.forward(self._made, *arguments, values, views)
         self.__dict__.setdefault("value", self._arrays(outputs))
         return self._arrays(changes)
+
+
+def _any(step: Any) -> bool:
+    """Whether a number, or any of an array, is not 0."""
+    return step != 0.0 if isinstance(step, float) else bool(step.any())
 
 
 def _leaves(numbers: dict[str, Any], adjoint: dict[str, Any]) -> list[Any]:

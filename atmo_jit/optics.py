@@ -110,8 +110,9 @@ class Optics:
             "asymmetry": [[p.g for p in of_part if hasattr(p, "g")] for of_part in phases],
         }
         if phase_degree is not None:
-            made["phase_tables"] = {phase_degree: self._phase_series(atmosphere, phase_degree)}
-            made["moment_tables"] = {degree: self.scatterers_moments(degree, atmosphere) for degree in degrees}
+            scatterers = self._phases_of(atmosphere)
+            made["phase_tables"] = {phase_degree: phase_series(scatterers, phase_degree)}
+            made["moment_tables"] = {degree: phase_moments(scatterers, degree) for degree in degrees}
         return made
 
     def channels(self, numbers: dict[str, Any]) -> list[int | None]:
@@ -257,10 +258,7 @@ class Optics:
         scatterer x channel], between which the light of order 1 interpolates linearly."""
         if degree in self.phase_tables:
             return self.phase_tables[degree]
-        return table(self._phase_series(self.atmosphere, degree))
-
-    def _phase_series(self, atmosphere: Atmosphere, degree: int) -> np.ndarray:
-        return phase_series(self._phases_of(atmosphere), degree)
+        return table(phase_series(self._phases_of(self.atmosphere), degree))
 
     def phase_moments(self, degree: int) -> Any:
         """Legendre moments chi_l of the scatterers: table [l, scatterer x channel]."""
@@ -268,10 +266,9 @@ class Optics:
             return self.moment_tables[degree]
         return table(self.scatterers_moments(degree))
 
-    def scatterers_moments(self, degree: int, atmosphere: Atmosphere | None = None) -> np.ndarray:
-        """Legendre moments chi_l of the scatterers, or of those of an ``atmosphere`` like this: [l, scatterer x
-        channel]."""
-        return phase_moments(self._phases_of(atmosphere or self.atmosphere), degree)
+    def scatterers_moments(self, degree: int) -> np.ndarray:
+        """Legendre moments chi_l of the scatterers: [l, scatterer x channel]."""
+        return phase_moments(self._phases_of(self.atmosphere), degree)
 
     def _phases_of(self, atmosphere: Atmosphere) -> tuple[Any, ...]:
         """The scatterers' phase functions in every channel."""
