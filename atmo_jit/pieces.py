@@ -32,7 +32,6 @@ from .optics import Optics
 from .ray_sums import RaySums
 
 LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves a level too slowly to tell where
-FARTHER = 0.05  # of a piece: a step over which light changes by far more than its rounding
 # Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
 # line, leaves single precision.
 NOTHING = 1e-18
@@ -182,7 +181,7 @@ def light_along(
         one, weight = held[:channels], held[channels:]
         scatters = total > NOTHING
         at = dr.fma(length, dr.select(scatters, centroid / dr.select(scatters, total, 1.0), 0.5), start)
-        toward = _asked(optics, source, here, at, length, scatters)
+        toward = _asked(optics, source, here, at, scatters)
         for n in range(len(scatterers)):
             for c in range(channels):
                 more[c] = dr.fma(weight[n * channels + c], dr.maximum(toward[n * channels + c], 0.0), more[c])
@@ -194,31 +193,12 @@ def light_along(
     )
 
 
-def _asked(optics: Optics, source: Field, rays: Rays, at: Any, length: Any, active: Any) -> list[Any]:
-    """The source at a distance along each ray: [scatterer x channel].
-
-    Where only the distance carries derivatives, as the centroid of a piece does, they are differences of the source a
-    little farther on: to propagate them through its sum of harmonics takes ten times as long.
-    """
-
-    def toward(distance: Any) -> list[Any]:
-        altitude, r, sun = point_along(optics, rays, distance)
-        mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -UPRIGHT, UPRIGHT)
-        values = source.unclipped(altitude, sun, mu, relative_azimuth(mu, sun, rays.nu), active)
-        return [value for of_kind in values for value in of_kind]
-
-    if not dr.grad_enabled(at) or dr.grad_enabled(rays.h, rays.mu, rays.mu_s, rays.nu, rays.stop):
-        return evaluated(toward(at))
-    step = FARTHER * dr.detach(length)
-    values = toward(dr.detach(at))
-    with dr.suspend_grad():
-        here = dr.detach(values)
-        slopes = [(v - u) / step for v, u in zip(toward(dr.detach(at) + step), here, strict=True)]
-        slopes = [dr.select(active, slope, 0.0) for slope in slopes]
-    held = evaluated([*values, *slopes])
-    values, slopes = held[: len(values)], held[len(values) :]
-    by = at - dr.detach(at)
-    return [dr.fma(by, slope, value) for value, slope in zip(values, slopes, strict=True)]
+def _asked(optics: Optics, source: Field, rays: Rays, distance: Any, active: Any) -> list[Any]:
+    """The source at a distance along each ray, evaluated: [scatterer x channel]."""
+    altitude, r, sun = point_along(optics, rays, distance)
+    mu = dr.clip(dr.fma(optics.radius + rays.h, rays.mu, distance) / r, -UPRIGHT, UPRIGHT)
+    values = source.unclipped(altitude, sun, mu, relative_azimuth(mu, sun, rays.nu), active)
+    return evaluated([value for of_kind in values for value in of_kind])
 
 
 def _at_its_level(optics: Optics, rays: Rays, distance: Any) -> Any:
