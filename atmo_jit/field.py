@@ -3,8 +3,9 @@ view ray.
 
 A field stores, per unit of solar irradiance and per altitude node, sun node and channel, a positive reference (the
 zeroth moment of order 1) and every moment divided by it. Light is the sun's irradiance times that: linear in it to
-rounding, however ill-conditioned the sum of orders is. The reference is interpolated in its logarithm, the quotients linearly: at twilight light falls
-by a factor of two per degree, and linear interpolation of the moments themselves would be wrong by 8 %.
+rounding, however ill-conditioned the sum of orders is. The reference is interpolated in its logarithm, the quotients
+linearly: at twilight light falls by a factor of two per degree, and linear interpolation of the moments themselves
+would be wrong by 8 %.
 """
 
 from __future__ import annotations

@@ -38,8 +38,8 @@ from .resolution import Resolution
 
 
 class Sunbeam:
-    """Direct sunlight at the levels of paths per unit of ``Optics.solar``: transmittance toward the sun times the visible
-    part of its disc, linear in mu_s.
+    """Direct sunlight at the levels of paths per unit of ``Optics.solar``: transmittance toward the sun times the
+    visible part of its disc, linear in mu_s.
 
     ``table`` [levels, COSINES, size]: from the lowest mu_s at which the top still sees the sun up to 1.
     """
