@@ -85,7 +85,7 @@ class Bundle:
         total = [not_negative(v) for v in parts[kinds * channels :]]
         for n, k in enumerate(optics.scatterers):
             for c, phase in enumerate(optics.phase_values(k, nu)):
-                total[c] = dr.fma(phase, not_negative(parts[n * channels + c]), total[c])
+                total[c] = dr.fma(optics.solar[c] * phase, not_negative(parts[n * channels + c]), total[c])
         if more is not None:
             total = [v + not_negative(m) for v, m in zip(total, _series(more, node, channels, cos_phi), strict=True)]
         return total
@@ -195,6 +195,7 @@ class Bundle:
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
         _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, visit, max_iterations=-1, label="bundle")
+        sums = [e * s for e, s in zip(optics.solar, sums, strict=True)]
         if ground:
             dr.eval(sums)
             field.prepare()

@@ -1,9 +1,11 @@
 """The solved radiance field: harmonic moments of the light of all orders at the nodes, and what it scatters toward a
 view ray.
 
-A field stores, per altitude node, sun node and channel, a positive reference (the zeroth moment of order 1) and every
-moment divided by it. The reference is interpolated in its logarithm, the quotients linearly: at twilight light falls
-by a factor of two per degree, and linear interpolation of the moments themselves would be wrong by 8 %.
+A field stores, per unit of solar irradiance and per altitude node, sun node and channel, a positive reference (the
+zeroth moment of order 1) and every moment divided by it. Light is the sun's irradiance times that: linear in it to
+rounding, however ill-conditioned the sum of orders is. The reference is interpolated in its logarithm, the quotients
+linearly: at twilight light falls by a factor of two per degree, and linear interpolation of the moments themselves
+would be wrong by 8 %.
 """
 
 from __future__ import annotations
@@ -164,7 +166,7 @@ class Field:
         # Geometric between altitudes: at twilight the level below lies in the shadow and the one above in the light.
         optics = self.optics.spread(dr.width(h))
         above = optics.scattering_depths(self.columns.upward(h, optics))
-        return [dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
+        return [optics.solar[c] * dr.exp(dr.lerp(logs[0][c], logs[1][c], fk)) * above[c] for c in channels]
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """Integral of phase function times radiance over the sphere, toward (mu, phi): [scatterer][channel]
@@ -209,7 +211,8 @@ class Field:
             steps = mu - basis.mu, sine * cos_phi - basis.x
             for step, slopes in zip(steps, sums[1:], strict=True):
                 total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
-        return [total[n * channels : (n + 1) * channels] for n in range(kinds)]
+        solar = self.optics.spread(width).solar
+        return [[e * v for e, v in zip(solar, total[n * channels :], strict=False)] for n in range(kinds)]
 
 
 class _Harmonics:

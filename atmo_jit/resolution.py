@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
+from .profile import Tabulated
 
 CLOUD = 3.0  # optical depth
 DEEP = 8.0  # of what scatters nearly all light: there are
@@ -118,11 +119,20 @@ class Resolution:
             first_degree=first,
             # Two levels leave 3 % of the light that twilight brings to the ground of a small planet.
             beam_refine=(2, 3, 3, 3)[level],
-            # Between rows a column is linear in the root of the depth below a break, which derivatives by profiles see.
-            columns=(384, 192) if fine else (128, 96),
+            columns=_columns(atmosphere, fine),
             # As many as the azimuths tell apart when what they see is projected on the first ones.
             phase_degree=max(16, first + 8),
         )
+
+
+def _columns(atmosphere: Atmosphere, fine: bool) -> tuple[int, int]:
+    """Size of the table of columns to the sun, which is linear between its rows in the distance to the break above.
+
+    Derivatives by profiles see that it is; and light behind an optical depth of 10 is off by ten times as much as the
+    column, which a tabulated density, falling linearly over a shell of any thickness, bends more than others do.
+    """
+    tabulated = any(isinstance(c.profile, Tabulated) for c in atmosphere.constituents)
+    return (512 if tabulated else 384 if fine else 128), (192 if fine else 96)
 
 
 def _stage(degree: int) -> Stage:

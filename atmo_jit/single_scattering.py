@@ -38,8 +38,8 @@ from .resolution import Resolution
 
 
 class Sunbeam:
-    """Direct sunlight at the levels of paths: transmittance toward the sun times the visible part of its disc, linear
-    in mu_s.
+    """Direct sunlight at the levels of paths per unit of ``Optics.solar``: transmittance toward the sun times the
+    visible part of its disc, linear in mu_s.
 
     ``table`` [levels, COSINES, size]: from the lowest mu_s at which the top still sees the sun up to 1.
     """
@@ -69,7 +69,7 @@ class Sunbeam:
         seen, *column = row(held, lane, 1 + kinds, once=True)
         optics = optics.spread(dr.width(lane))
         depths = optics.optical_depths(column) if kinds else [0.0] * optics.channel_count
-        light = [seen * dr.exp(-d) * e for d, e in zip(depths, optics.solar, strict=True)]
+        light = [seen * dr.exp(-d) for d in depths]
         self._table = stored(light, lane, self.size)
 
     def at(self, level: Any, mu_s: Any) -> list[Any]:

@@ -51,7 +51,7 @@ class SourceTable:
 
     def scattered(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """As :meth:`atmo_jit.field.Field.scattered`."""
-        t, channels = types(), self._field.optics.channel_count
+        t, channels, solar = types(), self._field.optics.channel_count, self._field.optics.solar
         nodes, weights, scales = self._field.corners(h, mu_s, active)
         x, y = (dr.acos(v) * ((n - 1) / np.pi) for v, n in ((mu, self._zeniths), (cos_phi, self._azimuths)))
         i, j = dr.minimum(t.UInt(x), self._zeniths - 2), dr.minimum(t.UInt(y), self._azimuths - 2)
@@ -65,6 +65,6 @@ class SourceTable:
             for step, share in zip(steps, shares, strict=True):
                 values = row(self._table, place + step, self._count, active=active)
                 found = [dr.fma(share, v, s) for v, s in zip(values, found, strict=True)]
-            scale = [weight * s for s in scales[corner // 2]]
+            scale = [weight * s * e for s, e in zip(scales[corner // 2], solar, strict=True)]
             sums = [dr.fma(scale[n % channels], f, s) for n, (f, s) in enumerate(zip(found, sums, strict=True))]
         return [[dr.maximum(s, 0.0) for s in sums[n : n + channels]] for n in range(0, self._count, channels)]

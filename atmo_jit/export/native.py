@@ -50,7 +50,7 @@ def files(sky: Sky) -> Made:
     metadata = {
         "mapping": "the package's own: altitudes and suns of atmo_jit.grid.Grid, harmonics of atmo_jit.harmonics; "
         "bands of up to four wavelengths are numbered",
-        "units": "moments and irradiances over the reference, the zeroth moment of order 1 (W m^-2 nm^-1)",
+        "units": "moments and irradiances over the reference (the zeroth moment of order 1), per solar irradiance",
         "wavelengthsNm": sky.atmosphere.wavelengths_nm.tolist(),
         "holds": {
             "moments": "[altitude][sun][l, m][channel], over the reference",

@@ -83,6 +83,20 @@ def test_derivatives_are_finite(number):
     assert errors["derivatives not finite"].sum() == 0.0 and errors["adjoint identity"] < 1e-5
 
 
+def test_light_is_linear_in_that_of_the_sun():
+    """A white gas of depth 330, whose light single precision does not determine: 1e-3 apart where its orders were
+    summed under another sun."""
+    gas = {"scattering_per_m": 330.0 / 5000.0, "scale_height_m": 5000}
+    views = np.array([0.0, 100.0, 7e4]), np.radians([10.0, 60.0, 80.0]), np.radians([0.0, 70.0, 120.0]), np.zeros(3)
+    one, seven = (
+        atmo_jit.Sky(
+            world(wavelengths_nm=[550], solar_irradiance=sun, rayleigh=gas, mie=None, ground_albedo=1.0)
+        ).rays(*views).radiance[0].numpy()
+        for sun in (1.0, 7.0)
+    )  # fmt: skip
+    assert one.min() > 0.0 and seven == pytest.approx(7.0 * one, rel=1e-6)
+
+
 def test_orders_of_a_sharp_peak_shrink():
     """48: fog with g = 0.99. Radiance that swings below 0 beside its peak grew fourfold with every order."""
     sky = atmo_jit.Sky(extreme_world(Random(48)))
