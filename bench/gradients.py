@@ -1,20 +1,22 @@
 """What derivatives cost beside the sky itself: ``python -m bench.gradients [--views N] [--tolerance T]``.
 
 Every row is measured in a process of its own, warm: each turn has another atmosphere of the same profiles, as a fit
-has. CPU milliseconds, the median of many turns, and the most memory beyond imports.
+has. CPU milliseconds, the median of many turns, and the most memory beyond imports: of several rounds, each with all
+rows, the medians, and those of the quotients within a round.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import subprocess
 import sys
 from typing import Any
 
 import numpy as np
 
-TURNS = 12
+TURNS, ROUNDS = 12, 3
 VALUES = ("mie.scattering_per_m", "mie.phase.g", "ground_albedo", "rayleigh.scattering_per_m")
 ALL_VALUES = (*VALUES, "mie.single_scattering_albedo", "ozone.absorption_per_m", "solar_irradiance")
 PROFILES = ("rayleigh.scale_height_m", "mie.scale_height_m", "ozone.center_m", "ozone.half_width_m")
@@ -85,21 +87,24 @@ def measure(row: str, views: int, tolerance: float) -> dict[str, float]:
 
 def table(views: int, tolerance: float) -> str:
     """The rows as Markdown."""
-    found = {}
-    for row in ROWS:
-        command = [sys.executable, "-m", __spec__.name if __spec__ else "bench.gradients", "--row", row]
-        command += ["--views", str(views), "--tolerance", str(tolerance)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        found[row] = json.loads(done.stdout.splitlines()[-1])
+    rounds = [{row: _measured(row, views, tolerance) for row in ROWS} for _ in range(ROUNDS)]
     lines = [f"| {views} views, tolerance {tolerance:g} | CPU ms | of primal | MiB | of primal |"]
     lines.append("|---|---|---|---|---|")
-    primal = found["primal"]
     for row, text in ROWS.items():
-        cells = [
-            (found[row][key], found[row][key] / primal[key], digits) for key, digits in (("cpu_ms", 0), ("peak_mib", 0))
-        ]
-        lines.append(f"| {text} | " + " | ".join(f"{value:.{d}f} | {share:.1f}" for value, share, d in cells) + " |")
+        cells = []
+        for key in ("cpu_ms", "peak_mib"):
+            value = statistics.median(found[row][key] for found in rounds)
+            share = statistics.median(found[row][key] / found["primal"][key] for found in rounds)
+            cells += [f"{value:.0f}", f"{share:.1f}"]
+        lines.append(f"| {text} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _measured(row: str, views: int, tolerance: float) -> dict[str, float]:
+    command = [sys.executable, "-m", __spec__.name if __spec__ else "bench.gradients", "--row", row]
+    command += ["--views", str(views), "--tolerance", str(tolerance)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:
