@@ -108,6 +108,7 @@ class Evaluation:
             if by_columns:
                 known = [band["columns"] for band in solved]
                 found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, tables))
+            dr.eval(found)  # one by one each would be a kernel
         return found, by_views
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
