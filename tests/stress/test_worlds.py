@@ -31,6 +31,18 @@ def test_light_is_that_of_the_twin(number):
     assert {name: worst[name] for name, limit in LIMITS.items() if worst.get(name, 0.0) > limit} == {}
 
 
+# Light behind some optical depths of air whose density falls linearly over a thick shell: 4e-3 off with 128 rows of
+# columns.
+@pytest.mark.parametrize("number", [37, 40, 61])
+def test_columns_to_the_sun_have_rows_enough(number):
+    rng = Random(number)
+    air = extreme_world(rng)
+    views = extreme_views(rng, air, PER_WORLD)
+    solved = Solved(air, 1)
+    errors = of_twin(air, views, [*solved.rays(views), *solved.irradiances(views)], Twin(air, tolerance=1e-6))
+    assert errors["single scattering, twin"].max() < 5e-4
+
+
 def test_a_horizontal_sun_shines_into_the_top_of_a_layer():
     """Into 200 m of 42 km, on a planet of 42,000 km: between two nodes of a ray, of the twin's as well where it has
     few."""
