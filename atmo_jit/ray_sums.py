@@ -23,19 +23,23 @@ class RaySums:
 
     def at_pieces(self, values: list[Any]) -> list[Any]:
         """Values of rays at their pieces."""
-        return _linear(self._at_pieces, self._totals, values)
+        return _linear(self._at_pieces, self._totals, values)  # to what is of no ray nothing comes back
 
     def totals(self, values: list[Any]) -> list[Any]:
         """Sums over all pieces of each ray."""
-        return _linear(self._totals, self._at_pieces, values)
+        return _linear(self._totals, lambda grads: self._at_pieces(grads, own=True), values)
 
     def before(self, values: list[Any]) -> list[Any]:
         """Sums over the pieces of the same ray that come before each."""
         return _linear(self._before, self._after, values)
 
-    def _at_pieces(self, values: list[Any]) -> list[Any]:
+    def _at_pieces(self, values: list[Any], *, own: bool = False) -> list[Any]:
+        """``own``: 0 where a piece is of no ray."""
+        t = types()
         dr.eval(values)
-        return [dr.gather(types().Float, value, self._ray) for value in values]
+        count = dr.gather(t.UInt, self._first, dr.width(self._first) - 1)
+        active = dr.arange(t.UInt, dr.width(self._ray)) < count if own else True
+        return [dr.gather(t.Float, value, self._ray, active) for value in values]
 
     def _totals(self, values: list[Any]) -> list[Any]:
         ray = dr.arange(types().UInt, dr.width(self._first) - 1)
