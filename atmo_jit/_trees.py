@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -14,13 +15,10 @@ def flat(tree: Any) -> list[Any]:
     return [tree]
 
 
-def like(tree: Any, leaves: list[Any]) -> Any:
+def like(tree: Any, leaves: Iterable[Any]) -> Any:
     """The tree with other leaves."""
+    # Not a function within: one that calls itself holds on to the leaves until garbage is collected.
     remaining = iter(leaves)
-
-    def build(part: Any) -> Any:
-        if isinstance(part, dict):
-            return {key: build(p) for key, p in part.items()}
-        return [build(p) for p in part] if isinstance(part, list) else next(remaining)
-
-    return build(tree)
+    if isinstance(tree, dict):
+        return {key: like(part, remaining) for key, part in tree.items()}
+    return [like(part, remaining) for part in tree] if isinstance(tree, list) else next(remaining)

@@ -117,17 +117,7 @@ class Optics:
 
     def channels(self, numbers: dict[str, Any]) -> list[int | None]:
         """Which channel each leaf of ``numbers`` belongs to; None: to none, or to all, as a table does."""
-
-        def of(part: Any) -> list[int | None]:
-            if isinstance(part, dict):
-                return [channel for inner in part.values() for channel in of(inner)]
-            if not isinstance(part, list):
-                return [None]
-            if part and isinstance(part[0], list):
-                return [channel for inner in part for channel in of(inner)]
-            return list(range(len(part))) if len(part) == self.channel_count else [None] * len(part)
-
-        return of(numbers)
+        return _channels(numbers, self.channel_count)
 
     def values(self, degrees: tuple[int, ...], phase_degree: int) -> dict[str, Any]:
         """Everything that kernels read of an atmosphere, with phase moments up to ``degrees``."""
@@ -286,6 +276,16 @@ class Optics:
     def breaks_m(self) -> np.ndarray:
         """Altitudes (m) at which rays are cut (levels.breaks)."""
         return levels.breaks(self.atmosphere)
+
+
+def _channels(part: Any, count: int) -> list[int | None]:
+    if isinstance(part, dict):
+        return [channel for inner in part.values() for channel in _channels(inner, count)]
+    if not isinstance(part, list):
+        return [None]
+    if part and isinstance(part[0], list):
+        return [channel for inner in part for channel in _channels(inner, count)]
+    return list(range(len(part))) if len(part) == count else [None] * len(part)
 
 
 def _maximum(values: list[Any]) -> Any:

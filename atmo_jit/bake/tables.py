@@ -235,21 +235,20 @@ class _Band4D:
         rows = size.up + size.down
         base = ((i * rows + j) * size.suns + k) * size.azimuths + m
         steps = (rows * size.suns * size.azimuths, size.suns * size.azimuths, size.azimuths, 1)
-        fractions = (fh, fm, fs, fp)
-
-        def blend(axis: int, offset: int) -> list[Any]:
-            if axis == 4:
-                return packet(self.values, types().UInt(base + offset), self.count)
-            low, high = blend(axis + 1, offset), blend(axis + 1, offset + steps[axis])
-            return [dr.lerp(a, b, fractions[axis]) for a, b in zip(low, high, strict=True)]
-
-        values = blend(0, 0)
+        values = self._blend(base, steps, (fh, fm, fs, fp))
         light = [
             [values[g * self.padded + c] * scattered[c] * light[c] for c in range(self.channels)]
             for g, scattered in enumerate(along)
         ]
         angular = 1.0 + SURVIVING * rays.nu * rays.nu
         return [angular * v for v in light[0]], light[1:], through[: self.channels]
+
+    def _blend(self, corner: Any, steps: tuple[Any, ...], fractions: tuple[Any, ...]) -> list[Any]:
+        """Values between nodes: linear along the first axis of those that are left, and so on."""
+        if not steps:
+            return packet(self.values, types().UInt(corner), self.count)
+        low, high = (self._blend(at, steps[1:], fractions[1:]) for at in (corner, corner + steps[0]))
+        return [dr.lerp(a, b, fractions[0]) for a, b in zip(low, high, strict=True)]
 
     def at(self, rays: Rays, place: dict[str, Any], ground: bool) -> tuple[list[Any], list[Any]]:
         """Radiance and transmittance per channel."""
