@@ -53,11 +53,11 @@ class RayLight:
 
 
 class _Band:
-    """The solution at up to four wavelengths."""
+    """The solution at up to four wavelengths; ``field`` None: without its light."""
 
-    def __init__(self, optics: Optics, columns: SunColumns, field: Field) -> None:
+    def __init__(self, optics: Optics, columns: SunColumns, field: Any = None) -> None:
         self.optics, self.columns, self.field = optics, columns, field
-        self.source = field if field.scatters and optics.scatterers else None
+        self.source = field if field is not None and field.scatters and optics.scatterers else None
 
 
 class Sky:
@@ -115,6 +115,14 @@ class Sky:
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns)
+
+    @property
+    def unlit(self) -> Sky:
+        """This sky without its light, which ``again`` and its like do not ask for: what is kept for long holds no
+        tables of one solve."""
+        other = copy(self)
+        other._bands = [_Band(band.optics, band.columns) for band in self._bands]
+        return other
 
     def columns_again(self, values: list[dict[str, Any]], known: list[Any] | None = None) -> list[Any]:
         """The tables of SunColumns for other ``values`` (Optics.values) of the bands, which may carry derivatives;

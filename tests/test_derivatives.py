@@ -3,6 +3,9 @@ reverse, through Dr.Jit and JAX, and finite wherever geometry is singular."""
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from tolerances import (
 from twins import Twin, cosines
 
 import atmo_jit
+from atmo_jit._trees import like
 from atmo_jit.backend import types
 from atmo_jit.derivatives import OUTPUTS, Linearization, jacobian
 from atmo_jit.errors import InputError
@@ -359,3 +363,37 @@ def test_few_orders_tell_of_those_that_follow(monkeypatch):
     assert few <= 5 < many
     for name in names:
         assert np.abs(found[name] - want[name]).max() < DIFFERENCES * np.abs(want[name]).max(), name
+
+
+def test_a_solve_that_is_gone_leaves_no_light():
+    """What derivatives keep for the next atmosphere held the tables of the first solve; nothing waits for garbage to be
+    collected."""
+    gc.collect()
+    gc.disable()
+    try:
+        fields = []
+        for factor in (1.0, 1.1):
+            at = atmo_jit.linearize(EARTH.replace({"mie.scattering_per_m": [4e-6 * factor] * 3}), VIEWPOINTS)
+            at.vjp({"radiance": 1.0}, ["mie.scattering_per_m", "rayleigh.scale_height_m"])
+            fields.append(weakref.ref(at.sky.solutions[0].field))
+        del at
+        assert [field() for field in fields] == [None, None]
+    finally:
+        gc.enable()
+
+
+def test_a_tree_of_leaves_does_not_hold_on_to_those_given():
+    """A closure that calls itself did, with all tables of a solve, until garbage was collected."""
+
+    class Leaf:
+        pass
+
+    gc.disable()
+    try:
+        leaf = Leaf()
+        held = weakref.ref(leaf)
+        assert like({"of": [0, 1]}, [leaf, 2]) == {"of": [leaf, 2]}
+        del leaf
+        assert held() is None
+    finally:
+        gc.enable()
