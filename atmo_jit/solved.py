@@ -66,8 +66,8 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
-    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere like this one whose nodes are used, so
+    that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
     :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
     orders are solved, for derivatives; ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
     InputError.
@@ -114,7 +114,7 @@ class Sky:
     @property
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
-        return Grid.of(self.layout, self.resolution, self.suns)
+        return Grid.of(self.layout, self.resolution, self.suns, self.atmosphere)
 
     def columns_again(self, values: list[dict[str, Any]], known: list[Any] | None = None) -> list[Any]:
         """The tables of SunColumns for other ``values`` (Optics.values) of the bands, which may carry derivatives;
