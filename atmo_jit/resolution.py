@@ -23,7 +23,7 @@ MANY = 20  # events; light that has as many is lost by what each order lacks
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 # More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
-FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 4, 1.3, 8, 12
+FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 12
 FINE_NEAR_GROUND, FINE_ORDERS = 1.0, 2  # see Resolution.near_ground; azimuthal orders more
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
@@ -120,7 +120,7 @@ class Resolution:
             refine=4 if fine else 2,
             sun_refine=8 if fine else 4,
             suns=(21, 25, 29, 33)[level] + (FINE_SUNS if fine else 0),
-            first_suns=(1, 2, 2, 2)[level],
+            first_suns=4 if fine else (1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
             stages=tuple(dict.fromkeys(stages)),
             first_up=max(10, first),
