@@ -30,7 +30,7 @@ NARROW = {"single_scattering_albedo": 0.004, "ground_albedo": 0.02}  # which end
 STEP = 0.03  # relative, of all others: single precision leaves 3e-5 of a logarithmic derivative
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0))
 LIMITS = ("beyond a degree of the horizon", 1e-3), ("within a degree of it", 1e-2)
-COARSER, FINER = (1.5, 1.5, 1, 2), (2.0, 2.5, 2, 4)  # altitudes, suns, steps of the degree, azimuthal orders
+COARSER, FINER = (1.3, 1.5, 1, 2), (1.7, 2.0, 1, 4)  # altitudes, suns, steps of the degree, azimuthal orders
 
 
 def drawn(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -89,6 +89,7 @@ def finer(resolution: Any, altitudes: float, suns: float, degrees: int, orders: 
         resolution,
         altitudes=int(altitudes * resolution.altitudes),
         suns=int(suns * resolution.suns),
+        first_suns=2,
         stages=stages,
         nodes=4,
         first_up=degree + 4,
