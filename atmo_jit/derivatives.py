@@ -22,6 +22,7 @@ from .backend import doubles, floats, one_at_a_time
 from .errors import InputError
 from .evaluation import OUTPUTS, Evaluation, TableEvaluation, where
 from .grid import Grid
+from .needs import Needs, suns_to_solve
 from .optics import Optics, on_device
 from .parameters import (
     RADII,
@@ -75,9 +76,17 @@ class Linearization:
         self._solving = {"orders": orders, "tolerance": tolerance}
         too = [c.name for c in self.atmosphere.constituents]
         finer = {"sure": True, "fine": fine, "scattering_too": too}
-        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, layout=layout, **finer)
+        resolution = resolution or Resolution.suited(self.atmosphere, tolerance, fine=fine)
+        suns = self._suns(resolution) if fine else None
+        self.sky = Sky(self.atmosphere, orders, tolerance, resolution, suns, layout, **finer)
         r = self.sky.resolution
         self._degrees, self._phase_degree = r.degrees, r.phase_degree
+
+    def _suns(self, resolution: Resolution) -> tuple[float, float] | None:
+        """The range of suns (radians) that are solved: fine solves have many, and views seldom many suns."""
+        needs = Needs.of_views(self.atmosphere, self.views)
+        suns, _ = suns_to_solve(self.atmosphere, needs, resolution)
+        return suns and (float(np.radians(suns[0])), float(np.radians(suns[1])))
 
     def moved(self, parameters: Mapping[str, Any]) -> Linearization:
         """The linearization where parameters, arrays by name, have other values.

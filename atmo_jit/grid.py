@@ -17,10 +17,12 @@ import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
 from .backend import Keeper, floats, parameter, types
+from .levels import corners
 from .profile import Tabulated
 from .resolution import Resolution, column_of
 
 _FINE = 2048
+NEAREST = 50.0  # m: what is nearer to the ground is as near
 _PLANET = ("bottom_radius_m", "top_radius_m", "sun_angular_radius_deg")
 NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
@@ -41,10 +43,19 @@ class Grid(Keeper):
     _known: ClassVar[OrderedDict[Any, Grid]] = OrderedDict()
 
     @classmethod
-    def of(cls, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None) -> Grid:
+    def of(
+        cls,
+        atmosphere: Atmosphere,
+        resolution: Resolution,
+        suns: tuple[float, float] | None = None,
+        profiles: Atmosphere | None = None,
+    ) -> Grid:
         """The grid for an atmosphere; the same object for atmospheres with the same profiles and roughly the same
-        optical depths, so that what is built on it is kept."""
+        optical depths, so that what is built on it is kept. ``profiles``: the atmosphere whose profiles are met on
+        these nodes, where they may be others."""
+        own, met = (_not_nodes(air) for air in (atmosphere, profiles or atmosphere))
         key = (
+            None if met == own else met,
             types().__name__,
             resolution,
             suns,
@@ -54,7 +65,7 @@ class Grid(Keeper):
             *((profile_key(c.profile), *_matter(atmosphere, c)) for c in atmosphere.constituents),
         )
         if key not in cls._known:
-            cls._known[key] = cls(atmosphere, resolution, suns)
+            cls._known[key] = cls(atmosphere, resolution, suns, profiles)
         cls._known.move_to_end(key)
         while len(cls._known) > REMEMBERED:
             cls._known.popitem(last=False)
@@ -73,11 +84,16 @@ class Grid(Keeper):
         )
 
     def __init__(
-        self, atmosphere: Atmosphere, resolution: Resolution, suns: tuple[float, float] | None = None
+        self,
+        atmosphere: Atmosphere,
+        resolution: Resolution,
+        suns: tuple[float, float] | None = None,
+        profiles: Atmosphere | None = None,
     ) -> None:
         self.resolution = resolution
         self.radius_m = atmosphere.bottom_radius_m
         self.thickness_m = atmosphere.thickness_m
+        self.kinks_m = corners(profiles or atmosphere)[1:-1]
         self._kept: dict[Any, Any] = {}
         self._place_altitudes(atmosphere, resolution)
         self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
@@ -101,6 +117,9 @@ class Grid(Keeper):
             share = density ** (1.0 / 3.0) * step
             if scatters and share.sum() > 0:
                 rise = rise + share / share.sum()
+        # On a plane light near a level bottom changes as h ln h: nearly level rays there see the ground or do not.
+        near = np.diff(np.log1p(h / NEAREST))
+        rise = rise + resolution.near_ground * near / near.sum()
         # Light in a thick layer changes within a free path of its top and bottom, slowly between.
         below = np.cumsum(depth) - 0.5 * depth
         above = depth.sum() - below
@@ -161,10 +180,7 @@ class Grid(Keeper):
 
     def u_of(self, h: np.ndarray) -> np.ndarray:
         """Altitude coordinate, k at solved altitude k (float64)."""
-        return np.interp(self._position(np.asarray(h)), np.arange(_FINE + 1), self._u)
-
-    def _position(self, h: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.clip(h / self.thickness_m, 0.0, 1.0)) * _FINE
+        return np.interp(np.asarray(h), self._h_of_u, self._u)
 
     def prepare(self) -> None:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
@@ -182,13 +198,14 @@ class Grid(Keeper):
     def locate_altitude(self, h: Any) -> tuple[Any, Any]:
         """Index of the level below altitude ``h`` and the fraction of the way to the next."""
         t = types()
-        # The slope of a square root at 0 is no slope of the light: on the ground that of a little above is taken.
-        lowest = 4.0 / _FINE**2
         share = dr.clip(h * parameter(1.0 / self.thickness_m), 0.0, 1.0)
-        position = dr.sqrt(share + dr.detach(dr.maximum(lowest - share, 0.0))) * _FINE
-        cell = dr.minimum(t.UInt(position), _FINE - 1)
+        # Samples lie at squares, and u is linear in h between two of them: linear in the root it would have slopes by
+        # altitude that jump by half a per cent at each sample near the ground, and none on it.
+        cell = dr.minimum(t.UInt(dr.sqrt(dr.detach(share)) * _FINE), _FINE - 1)
+        start = t.Float(cell)
+        fraction = dr.fma(share, float(_FINE**2), -start * start) / dr.fma(2.0, start, 1.0)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return split(dr.lerp(u0, u1, position - t.Float(cell)) * float(self.refine), self._counts[0])
+        return split(dr.lerp(u0, u1, fraction) * float(self.refine), self._counts[0])
 
     @cached_property
     def _sun_map(self) -> list[Any]:
@@ -243,6 +260,11 @@ def _matter(atmosphere: Atmosphere, constituent: Constituent) -> tuple[bool, int
     nodes."""
     depth = float(np.max(constituent.extinction_per_m)) * column_of(atmosphere, constituent)
     return bool(np.any(constituent.scattering_per_m > 0)), max(-2, round(np.log2(max(depth, 1e-9))))
+
+
+def _not_nodes(atmosphere: Atmosphere) -> Any:
+    """What tables are made of that are kept with a grid."""
+    return atmosphere.sun_angular_radius_deg, *(profile_key(c.profile) for c in atmosphere.constituents)
 
 
 def profile_key(profile: Any) -> Any:

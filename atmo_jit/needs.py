@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 
 from .atmosphere import Atmosphere
+from .grid import Grid
+from .resolution import Resolution
 from .views import check_views
 
 # Views of one observer and one sun from which a table of the sky pays: it has this many nodes, each a march.
+SUN_STEP_DEG = 2.0  # suns that are solved begin and end at multiples of it: the next sun then finds the same grid
 TABLE_NODES = 14_162
 
 
@@ -126,3 +129,17 @@ def _inside(air: Atmosphere, h: np.ndarray, mu: np.ndarray) -> tuple[np.ndarray,
 
 def _range(values: np.ndarray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
+
+
+def suns_to_solve(air: Atmosphere, needs: Needs, resolution: Resolution) -> tuple[tuple[float, float] | None, int]:
+    """The range of suns to be solved (degrees, at the observers; None: all), and how many nodes that has."""
+    # The grid goes on by one dip of the top's horizon to either side. For observers inside the air that is as far as
+    # their rays go and light arrives from; from space rays graze the air at both ends of the range.
+    inside = needs.altitudes_m[1] <= air.thickness_m
+    dip = np.degrees(np.arccos(air.bottom_radius_m / air.top_radius_m)) if inside else 0.0
+    low = min(needs.suns_deg[0], needs.air_suns_deg[0] + dip)
+    high = max(needs.suns_deg[1], needs.air_suns_deg[1] - dip)
+    low = SUN_STEP_DEG * np.floor(max(low, 0.0) / SUN_STEP_DEG)
+    high = SUN_STEP_DEG * np.ceil(min(high, 180.0) / SUN_STEP_DEG)
+    nodes = Grid.of(air, resolution, tuple(np.radians([low, high]).tolist())).shape[1]
+    return (None, resolution.suns) if nodes >= resolution.suns else ((float(low), float(high)), nodes)

@@ -189,23 +189,48 @@ class Paths(Keeper):
         piece = np.repeat(np.arange(len(follows)), parts)
         number = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
         start = self.distance[follows[piece]] + number * part_length[piece]
-        at = start[:, None] + part_length[piece][:, None] * x
+        end = (self.distance[follows] + parts * part_length)[piece]
+        piece, start, end = self._cut_at_kinks(follows, piece, start, end)
+        last = np.append(piece[1:] != piece[:-1], True)
+        step = np.where(last, end, np.roll(start, -1)) - start
+        at = start[:, None] + step[:, None] * x
         h = self._altitude(np.repeat(ray[piece], nodes), at.ravel())
         behind = np.repeat(follows[piece], nodes)
         shares = self._shares(behind, at.ravel())
         per_station = np.zeros(self.count, dtype=int)
-        per_station[follows] = parts
+        per_station[follows] = np.bincount(piece, minlength=len(follows))
         first_part = np.concatenate([[0], np.cumsum(per_station)])
         return Points(
             paths=self,
             nodes=nodes,
             h=h,
-            length=np.repeat(part_length[piece], nodes),
-            weight=(part_length[piece][:, None] * w).ravel(),
+            length=np.repeat(step, nodes),
+            weight=(step[:, None] * w).ravel(),
             shares=shares,
             first_part=first_part,
             part_ray=ray[piece],
         )
+
+    def _cut_at_kinks(
+        self, follows: np.ndarray, piece: np.ndarray, start: np.ndarray, end: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Parts, in order, by the ``piece`` that each is of, where it starts and where that piece ends: also cut where
+        a piece, after the stations ``follows``, crosses a kink of a profile. Gauss points do not know of kinks between
+        them, and the derivative by the altitude of one is a step there."""
+        ray, pieces = self.ray[follows], np.arange(len(follows))
+        low, high = (self._altitude(ray, self.distance[follows + i]) for i in (0, 1))
+        whole = np.zeros(len(follows))
+        whole[piece] = end
+        r, r_mu = self.grid.radius_m + self.h[ray], (self.grid.radius_m + self.h[ray]) * self.mu_start[ray]
+        for kink in self.grid.kinks_m:
+            square = r_mu**2 - (self.h[ray] - kink) * (self.grid.radius_m + kink + r)
+            crossing = np.copysign(np.sqrt(np.maximum(square, 0.0)), high - low) - r_mu
+            cut = (np.minimum(low, high) < kink) & (kink < np.maximum(low, high))
+            cut &= (crossing > self.distance[follows]) & (crossing < whole)
+            piece, start = np.append(piece, pieces[cut]), np.append(start, crossing[cut])
+        order = np.lexsort((start, piece))
+        piece = piece[order]
+        return piece, start[order], whole[piece]
 
     def _shares(self, behind: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """Lagrange polynomials in the distance through two stations behind and two ahead, or as many as there are:

@@ -32,6 +32,7 @@ from .optics import Optics
 from .ray_sums import RaySums
 
 LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves a level too slowly to tell where
+TWICE = (0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5)  # of a piece: Gauss points, where fine solves ask for the field
 # Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
 # line, leaves single precision.
 NOTHING = 1e-18
@@ -146,6 +147,8 @@ def light_along(
     amounts = along.before(own)
     phases = {k: optics.phase_values(k, nu) for k in optics.scatterers}
     scatterers = optics.scatterers
+    twice = source is not None and source.grid.resolution.twice
+    each = channels * len(scatterers)
 
     def node(g: Any, one: list[Any], weight: list[Any], centroid: Any, total: Any, given: Any) -> tuple[Any, ...]:
         values, here, phases, density, amounts, length, start = given
@@ -164,12 +167,15 @@ def light_along(
                 coefficient = local.scattering[k][c] * there[k]
                 one[c] = dr.fma(coefficient * phases[k][c], lit[c], one[c])
                 if source is not None:
-                    share = coefficient * seen[c]
-                    weight[n * channels + c] = weight[n * channels + c] + share
+                    share, place = coefficient * seen[c], n * channels + c
+                    if twice:
+                        later = share * ((x - TWICE[0]) / (TWICE[1] - TWICE[0]))
+                        weight[each + place] = weight[each + place] + later
+                    weight[place] = weight[place] + share
                     total, centroid = total + share, dr.fma(share, x, centroid)
         return g + 1, one, weight, centroid, total
 
-    zeros = [dr.zeros(t.Float, pieces.count) for _ in range(channels * (1 + len(scatterers)) + 2)]
+    zeros = [dr.zeros(t.Float, pieces.count) for _ in range(channels + each * (1 + twice) + 2)]
     state = (t.UInt(0), zeros[:channels], zeros[channels:-2], zeros[-2], zeros[-1])
     given = [optics.used, vars(here), phases, density, amounts, length, start]
     given = like(given, together(flat(given)))  # by all of them in one kernel: each would run the loop once more
@@ -180,11 +186,18 @@ def light_along(
         *held, centroid, total = evaluated([*one, *weight, centroid, total])
         one, weight = held[:channels], held[channels:]
         scatters = total > NOTHING
-        at = dr.fma(length, dr.select(scatters, centroid / dr.select(scatters, total, 1.0), 0.5), start)
-        toward = _asked(optics, source, here, at, scatters)
-        for n in range(len(scatterers)):
-            for c in range(channels):
-                more[c] = dr.fma(weight[n * channels + c], dr.maximum(toward[n * channels + c], 0.0), more[c])
+        if twice:
+            # Not less than nothing at either place, where a piece's light is all at one end.
+            later = [dr.clip(second, 0.0, whole) for second, whole in zip(weight[each:], weight[:each], strict=True)]
+            first = [whole - second for second, whole in zip(later, weight[:each], strict=True)]
+            asked = [(dr.fma(length, x, start), w) for x, w in zip(TWICE, (first, later), strict=True)]
+        else:
+            centre = dr.select(scatters, centroid / dr.select(scatters, total, 1.0), 0.5)
+            asked = [(dr.fma(length, centre, start), weight)]
+        for at, weights in asked:
+            toward = _asked(optics, source, here, at, scatters)
+            for place, (w, v) in enumerate(zip(weights, toward, strict=True)):
+                more[place % channels] = dr.fma(w, dr.maximum(v, 0.0), more[place % channels])
     sums = along.totals([*one, *more, *own])
     return Light(
         [radiance * solar for radiance, solar in zip(sums[:channels], per_ray.solar, strict=True)],

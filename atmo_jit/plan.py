@@ -22,8 +22,7 @@ from . import plan_items
 from .atmosphere import Atmosphere
 from .costs import Cost, predict
 from .errors import InputError
-from .grid import Grid
-from .needs import TABLE_NODES, Needs
+from .needs import TABLE_NODES, Needs, suns_to_solve
 from .plan_items import Item
 from .resolution import Resolution
 
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 # Prediction and measurement may differ by this factor before it is said.
 OFF = 2.0
 SAMPLE, FINEST = 500, 1e-3  # views at which errors are looked at, least tolerance of what they are compared with
-SUN_STEP_DEG = 2.0  # suns that are solved begin and end at multiples of it: the next sun then finds the same grid
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def plan(
     tables = _pays(needs)
     marched = min(needs.views, TABLE_NODES) if tables else needs.views
     derivatives = plan_items.carried_by(needs.free)
-    suns, sun_nodes = _suns(kept, needs, resolution)
+    suns, sun_nodes = suns_to_solve(kept, needs, resolution)
     items = (
         *plan_items.matter(air, kept),
         *plan_items.multiple(kept, resolution, sun_nodes, tolerance, orders),
@@ -169,20 +167,6 @@ def _without_nothing(air: Atmosphere, free: Sequence[str]) -> Atmosphere:
     elif mie is not None and empty("mie"):
         document["mie"] = None
     return Atmosphere(document)
-
-
-def _suns(air: Atmosphere, needs: Needs, resolution: Resolution) -> tuple[tuple[float, float] | None, int]:
-    """The range of suns to be solved (degrees, at the observers; None: all), and how many nodes that has."""
-    # The grid goes on by one dip of the top's horizon to either side. For observers inside the air that is as far as
-    # their rays go and light arrives from; from space rays graze the air at both ends of the range.
-    inside = needs.altitudes_m[1] <= air.thickness_m
-    dip = np.degrees(np.arccos(air.bottom_radius_m / air.top_radius_m)) if inside else 0.0
-    low = min(needs.suns_deg[0], needs.air_suns_deg[0] + dip)
-    high = max(needs.suns_deg[1], needs.air_suns_deg[1] - dip)
-    low = SUN_STEP_DEG * np.floor(max(low, 0.0) / SUN_STEP_DEG)
-    high = SUN_STEP_DEG * np.ceil(min(high, 180.0) / SUN_STEP_DEG)
-    nodes = Grid.of(air, resolution, tuple(np.radians([low, high]).tolist())).shape[1]
-    return (None, resolution.suns) if nodes >= resolution.suns else ((float(low), float(high)), nodes)
 
 
 def _pays(needs: Needs) -> bool:

@@ -11,11 +11,12 @@ from typing import Any
 import drjit as dr
 
 from .backend import packet, row, row_size, stored, types
-from .grid import Grid, cubic
+from .grid import Grid
 from .projection import Moments
 
 FINE = 16  # parts of an interval of solved suns; 1.2 e-folds over it are then linear to 0.1 %
 STEEPEST = 1.2  # e-folds of the reference from one solved sun to the next
+LEAST = 1e-37
 DEEPEST = 3.0  # and from one altitude to the next
 
 
@@ -95,27 +96,50 @@ class Reference:
         s = dr.minimum(t.UInt(x), suns - 2)
         f = x - t.Float(s)
         low, high = (packet(held, level * suns + s + i, 4, active) for i in (0, 1))
-        return [dr.fma(f, high[c] - low[c], low[c]) for c in range(self.channels)]
+        # Between two suns it falls nearly exponentially, and a line's slope there would be 4 % off.
+        bend, values = f * (1.0 - f), []
+        for a, b in zip(low[: self.channels], high[: self.channels], strict=True):
+            rise = b - a
+            values.append(dr.fma(f, rise, a) - bend * rise * (rise / dr.maximum(a + b, LEAST)))
+        return values
 
 
 class Taps:
-    """Cubic interpolation at the sun coordinate ``x`` (s at node s of ``suns``): the nodes ``at`` and their weights.
+    """Interpolation at the sun coordinate ``x`` (s at node s of ``suns``) by the polynomial through six nodes: those
+    ``at``, and their weights.
 
-    Beyond the first node lies the mirrored second (the sun has passed through the zenith: a moment cos(m phi) changes
-    by (-1)^m), beyond the last the last.
+    Its slope is as exact between the nodes as a cubic's value. Beyond the first node lie the mirrored ones after it
+    (the sun has passed through the zenith: a moment cos(m phi) changes by (-1)^m), beyond the last the last.
     """
 
     def __init__(self, grid: Grid, x: Any, suns: int) -> None:
         t = types()
         s = dr.minimum(t.UInt(x), suns - 2)
-        self.weights = cubic(x - t.Float(s))
-        self.first = s == 0
-        before = dr.select(self.first, t.UInt(int(grid.whole_suns)), s - 1)
-        self.at = [before, s, s + 1, dr.minimum(s + 2, suns - 1)]
+        self.weights = quintic(x - t.Float(s))
+        self.mirrored, self.at = [], []
+        for n in (2, 1):
+            behind = dr.minimum(n - dr.minimum(s, n), suns - 1) if grid.whole_suns else t.UInt(0)
+            self.mirrored.append(s < n)
+            self.at.append(dr.select(s < n, behind, dr.maximum(s, n) - n))
+        for n in range(4):
+            self.mirrored.append(t.Bool(False))
+            self.at.append(dr.minimum(s + n, suns - 1))
 
     def sum(self, values: list[Any], sign: Any = 1.0) -> Any:
-        """Sum of weight times value; ``sign``: of the mirrored one."""
-        total = self.weights[0] * values[0] * dr.select(self.first, sign, 1.0)
-        for weight, value in zip(self.weights[1:], values[1:], strict=True):
-            total = dr.fma(weight, value, total)
+        """Sum of weight times value; ``sign``: of mirrored ones."""
+        total = 0.0
+        for weight, value, mirrored in zip(self.weights, values, self.mirrored, strict=True):
+            total = dr.fma(weight, value * dr.select(mirrored, sign, 1.0), total)
         return total
+
+
+def quintic(f: Any) -> list[Any]:
+    """Lagrange weights of the six nodes about a fraction ``f`` of the middle interval."""
+    below = [f + 2.0, f + 1.0, f, f - 1.0, f - 2.0, f - 3.0]
+    weights = []
+    for scale, skipped in zip((-120.0, 24.0, -12.0, 12.0, -24.0, 120.0), range(6), strict=True):
+        product = 1.0 / scale
+        for i in range(6):
+            product = product * below[i] if i != skipped else product
+        weights.append(product)
+    return weights

@@ -32,7 +32,7 @@ from .views import side_by_side
 
 # Share of the usual remainder that is left where derivatives are wanted, and fine ones: those of the light that orders
 # left out would add are less exact than that light.
-SURE, FINE = 0.03, 0.003
+SURE, FINE = 0.03, 0.0005
 
 
 @dataclass
@@ -66,8 +66,8 @@ class Sky:
     ``atmosphere``: an Atmosphere or what Atmosphere.load takes. ``orders``: scattering and reflection events counted
     (1: single scattering and directly lit ground only; None: all). ``tolerance``: relative error aimed at, from which
     the resolution follows unless it is given. ``suns``: range of sun zenith angles (radians, at the observer) that will
-    be asked for; light under other suns is not solved. ``layout``: an atmosphere with the same profiles whose nodes are
-    used, so that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
+    be asked for; light under other suns is not solved. ``layout``: an atmosphere like this one whose nodes are used, so
+    that atmospheres close to each other differ by nothing but their light. ``held``: the solution itself, as
     :attr:`held` gave it for the same arguments; nothing is solved then. ``scattering_too``: see Optics; ``sure``: more
     orders are solved, for derivatives; ``fine``: see Resolution.suited. Raises AtmosphereError, LLVMError,
     InputError.
@@ -114,7 +114,7 @@ class Sky:
     @property
     def grid(self) -> Grid:
         """The nodes that it is solved on."""
-        return Grid.of(self.layout, self.resolution, self.suns)
+        return Grid.of(self.layout, self.resolution, self.suns, self.atmosphere)
 
     @property
     def unlit(self) -> Sky:

@@ -1,5 +1,6 @@
 """Nodes, their maps and the interpolation between them."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -43,14 +44,31 @@ def test_a_range_of_suns_keeps_the_nodes_of_the_full_grid():
     assert part.sun_position(inside).numpy() == pytest.approx(np.arange(len(part.theta)), abs=2e-3)
 
 
-def test_taps_are_exact_for_parabolas_and_keep_parity():
+def test_taps_are_exact_for_quintics_and_keep_parity():
     g = grid(suns=25)
-    fine = np.arange(93) / 4  # up to the last but one interval: beyond the last node the last is repeated
+    fine = np.arange(89) / 4  # up to the last but two intervals: beyond the last node the last is repeated
     taps = Taps(g, floats(fine), 25)
-    even = taps.sum([3 - _as_float(at) ** 2 for at in taps.at], 1.0)
-    odd = taps.sum([2 * _as_float(at) for at in taps.at], -1.0)
-    assert even.numpy() == pytest.approx(3 - fine**2, rel=1e-5, abs=1e-4)
-    assert odd.numpy() == pytest.approx(2 * fine, rel=1e-5, abs=1e-4)
+    even = taps.sum([3 - _as_float(at) ** 4 / 1e3 for at in taps.at], 1.0)
+    odd = taps.sum([2 * _as_float(at) + _as_float(at) ** 5 / 1e4 for at in taps.at], -1.0)
+    assert even.numpy() == pytest.approx(3 - fine**4 / 1e3, rel=1e-5, abs=1e-4)
+    assert odd.numpy() == pytest.approx(2 * fine + fine**5 / 1e4, rel=1e-5, abs=1e-4)
+
+
+def test_the_slope_of_the_altitude_coordinate_is_smooth():
+    """Light moves with it: derivatives by altitude do."""
+    g = grid(altitudes=12)
+    h = floats(np.linspace(190.0, 230.0, 81))
+    dr.enable_grad(h)
+    level, share = g.locate_altitude(h)
+    dr.forward(h)
+    slopes = dr.grad(share).numpy()
+    assert np.all(np.diff(slopes) < 1e-4 * slopes.mean())  # it falls as the air thins, and nowhere rises
+
+
+def test_nodes_near_the_ground():
+    """As many altitudes, more of them in the lowest hundreds of metres."""
+    usual, fine = grid(altitudes=18), grid(altitudes=18, near_ground=1.0)
+    assert fine.h[1] < usual.h[1] / 4 and len(fine.h) == len(usual.h)
 
 
 def _as_float(index):

@@ -38,3 +38,15 @@ def test_columns_of_an_exponential(points):
     whole = _columns(optics, at).whole.numpy().reshape(-1, size)
     assert whole[0, 0] == pytest.approx(height * -np.expm1(-top / height), rel=1e-4)
     assert whole[2, 0] == pytest.approx(height * -np.expm1(-20000.0 / height), rel=1e-4)
+
+
+def test_columns_of_a_tent_and_of_a_change_of_its_place():
+    """Straight up, half width times the height, and next to nothing more where the tent moves: Gauss points lie on both
+    sides of its corners, wherever those are between two levels."""
+    air = Atmosphere.load("earth")
+    for centre in (24000.0, 25000.0, 26100.0):
+        there = air.replace({"ozone.center_m": centre})
+        grid = Grid.of(there, Resolution.suited(there, 0.03))
+        paths = Paths.trace(grid, np.zeros(1), np.ones(1), 1)
+        whole = _columns(Optics(there, np.arange(3)), paths.points(2)).whole.numpy().reshape(-1, 4)
+        assert whole[0, 2] == pytest.approx(15000.0, rel=1e-6)

@@ -58,7 +58,11 @@ def test_tangents_are_those_of_differences(kind, name, constituent, number):
     for derivative, up, down in zip(found, *ends, strict=True):
         want = (np.array(up, dtype=float) - np.array(down, dtype=float)) / (2.0 * STEP)
         rounding = 1e-5 * np.abs(up).max()
-        # A tent has corners, which differences round off.
+        if name.startswith("ozone") and len(want) == len(points.h) * 4:
+            # A tent has corners, which differences round off: not at points that a corner passes.
+            corners = np.array(optics.constituents[constituent].profile.kinks_m)
+            beside = np.any(np.abs(points.h[:, None] - corners) < 2.0 * STEP * value, axis=1)
+            derivative, want = (np.where(np.repeat(beside, 4), 0.0, v) for v in (derivative, want))
         assert np.mean(np.abs(derivative - want)) <= 0.02 * np.mean(np.abs(want)) + rounding
         if not name.startswith("ozone"):
             assert np.abs(derivative - want).max() <= 2e-3 * np.abs(want).max() + rounding

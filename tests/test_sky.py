@@ -332,3 +332,16 @@ def test_later_orders_at_the_terminator_seen_from_space(monkeypatch):
     monkeypatch.setattr("atmo_jit.march.MAX_TURN", 0.004)
     exact = solved.rays(*columns).radiance
     assert max(np.abs(a.numpy() / b.numpy() - 1.0).max() for a, b in zip(found, exact, strict=True)) < 0.12
+
+
+def test_nodes_of_another_profile_serve():
+    """On the nodes of ``layout``, whose own columns are kept with them, light is that of the atmosphere's own."""
+    air = atmo_jit.Atmosphere.load("earth").replace({"mie.scattering_per_m": 1e-4})
+    thin = air.replace({"mie.scale_height_m": 600.0})
+    views = [doubles(v) for v in (np.zeros(3), np.full(3, 1.0), np.radians([20.0, 60.0, 85.0]), np.full(3, 2.0))]
+    solved = Sky(air)  # leaves its columns with its nodes
+    own, elsewhere = (
+        Sky(thin, resolution=solved.resolution, layout=layout).rays(*views).radiance for layout in (None, air)
+    )
+    for a, b in zip(own, elsewhere, strict=True):
+        assert b.numpy() == pytest.approx(a.numpy(), rel=5e-3)
