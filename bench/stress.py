@@ -11,9 +11,13 @@ where a quantity is worst, and ``--first`` returns to it. Exit status 1 where a 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -243,33 +247,62 @@ def check_derivatives(rng: Random, world: Mapping[str, Any], views: dict[str, np
 
 
 def sweep(
-    pairs: int, first: int = 0, per_world: int = PER_WORLD, advance: Callable[[float], None] | None = None
+    pairs: int,
+    first: int = 0,
+    per_world: int = PER_WORLD,
+    advance: Callable[[float], None] | None = None,
+    jobs: int = 1,
 ) -> Tally:
-    """``pairs`` of atmosphere and view, from the atmosphere of number ``first`` on."""
-    twins, tally = load_twins(), Tally()
+    """``pairs`` of atmosphere and view, from the atmosphere of number ``first`` on; ``jobs``: processes."""
     count = -(-pairs // per_world)
-    for i, number in enumerate(range(first, first + count)):
-        rng = Random(number)
-        world = extreme_world(rng)
-        views = extreme_views(rng, world, per_world)
-        twin = twins.Twin(world, tolerance=TWIN_TOLERANCE)
-        tally.add(number, check_world(world, views, twin, solves=number % SOLVES_EVERY == 0))
-        if advance:
-            advance((i + 1) / count)
-    return tally
+    return _each(partial(_of_views, per_world=per_world), range(first, first + count), Tally(), advance, jobs)
+
+
+def _of_views(number: int, per_world: int) -> Errors:
+    rng = Random(number)
+    world = extreme_world(rng)
+    views = extreme_views(rng, world, per_world)
+    twin = load_twins().Twin(world, tolerance=TWIN_TOLERANCE)
+    return check_world(world, views, twin, solves=number % SOLVES_EVERY == 0)
 
 
 def sweep_derivatives(
-    checks: int, first: int = 0, tally: Tally | None = None, advance: Callable[[float], None] | None = None
+    checks: int,
+    first: int = 0,
+    tally: Tally | None = None,
+    advance: Callable[[float], None] | None = None,
+    jobs: int = 1,
 ) -> Tally:
     """``checks`` derivatives of a view by a parameter, 50 views and 4 parameters an atmosphere."""
-    tally, count = tally or Tally(), -(-checks // 200)
-    for i, number in enumerate(range(first, first + count)):
-        rng = Random(number)
-        world = extreme_world(rng, widths=(1, 1, 3))
-        tally.add(number, check_derivatives(rng, world, extreme_views(rng, world, 50), 4))
-        if advance:
-            advance((i + 1) / count)
+    numbers = range(first, first + -(-checks // 200))
+    return _each(_of_derivatives, numbers, tally or Tally(), advance, jobs)
+
+
+def _of_derivatives(number: int) -> Errors:
+    rng = Random(number)
+    world = extreme_world(rng, widths=(1, 1, 3))
+    return check_derivatives(rng, world, extreme_views(rng, world, 50), 4)
+
+
+def _each(
+    errors_of: Callable[[int], Errors],
+    numbers: range,
+    tally: Tally,
+    advance: Callable[[float], None] | None,
+    jobs: int,
+) -> Tally:
+    """The errors of every atmosphere, in the order of their numbers, by so many processes."""
+    with ExitStack() as stack:
+        if jobs > 1:
+            # Not forked: threads of the back end would be missing.
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")))
+            found = pool.map(errors_of, numbers)
+        else:
+            found = map(errors_of, numbers)
+        for i, (number, errors) in enumerate(zip(numbers, found, strict=True), 1):
+            tally.add(number, errors)
+            if advance:
+                advance(i / len(numbers))
     return tally
 
 
@@ -288,14 +321,15 @@ def main() -> int:
     parser.add_argument("--derivatives", type=int, default=2_000, help="by a parameter (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first atmosphere (default: %(default)s)")
     parser.add_argument("--per-world", type=int, default=PER_WORLD, help="views of each (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--markdown", type=Path, help="page whose table is replaced by this one")
     options = parser.parse_args()
     start = time.perf_counter()
     page = check_output(options.markdown, ".md") if options.markdown else None
     with progress_bar("pairs") as advance:
-        tally = sweep(options.pairs, options.first, options.per_world, advance)
+        tally = sweep(options.pairs, options.first, options.per_world, advance, options.jobs)
     with progress_bar("derivatives") as advance:
-        sweep_derivatives(options.derivatives, options.first, tally, advance)
+        sweep_derivatives(options.derivatives, options.first, tally, advance, options.jobs)
     print(table(tally))
     print(f"{options.pairs} pairs, {options.derivatives} derivatives, {time.perf_counter() - start:.0f} s")
     if page:
