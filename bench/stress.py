@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import atmo_jit
-from atmo_jit.backend import doubles, floats
+from atmo_jit.backend import doubles
 from atmo_jit.derivatives import OUTPUTS, Linearization
 from atmo_jit.files import atomic_outputs, check_output
 from atmo_jit.parameters import RADII, VIEWS, described, parameter_names
@@ -116,7 +116,7 @@ class Solved:
     def irradiances(self, views: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Of the sun and of the sky, [N, W]."""
         sun = np.radians(views["sun_zenith_deg"])
-        direct, scattered = self._sky.irradiance(floats(views["altitude_m"]), doubles(sun))
+        direct, scattered = self._sky.irradiance(doubles(views["altitude_m"]), doubles(sun))
         return _stacked(direct, sun), _stacked(scattered, sun)
 
 
