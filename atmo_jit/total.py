@@ -254,5 +254,6 @@ def _over(grid: Grid, irradiance: Any, per_depth: Any, channels: int) -> Any:
     # At the top itself 0 / 0: the quotient goes on as it changed over the interval below.
     level = lane // width
     near, far = (dr.maximum(over(dr.opaque(t.UInt, altitudes - 1 - n, 1)), 1e-30) for n in (1, 2))
-    steady = near * dr.clip(near / far, 0.25, 4.0)
+    # By logarithms: the derivative of near / far has the square of far in it, which leaves single precision.
+    steady = near * dr.exp(dr.clip(dr.log(near) - dr.log(far), np.log(0.25), np.log(4.0)))
     return evaluated(dr.select(level >= altitudes - 1, steady, over(level)))
