@@ -24,18 +24,21 @@ from atmo_jit.optics import on_device
 from atmo_jit.parameters import RADII, check_names, described, tangent
 from atmo_jit.solved import Sky
 
+from .near_ground import near_ground
+
 Changes = Mapping[str, np.ndarray]
 # Of the number that moves most, relative. Smaller, and float32 shows: pictures are known to 1e-6 or so.
 STEP = 5e-3
 
 
 class LinearizedSky:
-    """The sky of ``atmosphere``, solved for as many ``orders`` (None: all) as derivatives need."""
+    """The sky of ``atmosphere``, solved for as many ``orders`` (None: all) as derivatives need, at the altitudes of
+    pictures."""
 
     def __init__(self, atmosphere: Atmosphere, orders: int | None = None) -> None:
         self.atmosphere = atmosphere
         too = [c.name for c in atmosphere.constituents]
-        self.sky = Sky(atmosphere, orders, scattering_too=too, sure=True)
+        self.sky = Sky(atmosphere, orders, resolution=near_ground(atmosphere), scattering_too=too, sure=True)
 
     @cached_property
     def _numbers(self) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from .exposed import array, host
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
 from .linearized import Changes, LinearizedSky, unit_changes
+from .near_ground import near_ground
 from .shaded_air import later_orders
 from .shadow_volume import shadowed_interval
 from .skylight import Skylight
@@ -380,8 +381,10 @@ class AtmospherePath:
         key = id(emitter), id(emitter.sky_light), id(emitter.sky)
         if self._held is None or self._held[0] != key:
             sky = emitter.sky
-            if self.exposed is not None or self.orders is not None:
-                sky = Sky(self.exposed.atmosphere if self.exposed else sky.atmosphere, self.orders)
+            air = self.exposed.atmosphere if self.exposed else sky.atmosphere
+            resolution = near_ground(air)
+            if self.exposed is not None or self.orders is not None or resolution != sky.resolution:
+                sky = Sky(air, self.orders, resolution=resolution)
             self._held = key, emitter, self._made(emitter, sky)  # the emitter, so that no other gets its id
         self._held[2][0].refresh()
         return self._held[2]

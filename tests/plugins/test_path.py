@@ -266,6 +266,32 @@ def test_without_shapes_the_picture_is_the_sky(rgb, altitude):
     assert np.all(picture >= 0.0)
 
 
+def test_flat_rays_in_shallow_haze_have_the_light_of_a_field_of_many_altitudes(plugins):
+    """From a roof over dark ground, as in the shipped city: their light begins within metres of it."""
+    from dataclasses import replace
+
+    from atmo_jit.backend import doubles
+    from atmo_jit.resolution import Resolution
+    from atmo_jit.sky import Sky
+
+    mi.set_variant("llvm_ad_mono")
+    shallow = {**HAZE, "mie": {**HAZE["mie"], "scattering_per_m": [5e-4], "scale_height_m": 400}}
+    air = atmo_jit.Atmosphere.load(shallow)
+    sky = {"type": "atmosphere", "atmosphere": json.dumps(shallow), "sun_direction": [0.0, 1.0, 0.4], "altitude": 42.0}
+    views = np.array([[0.2, 1.0, 0.005], [0.2, 1.0, -0.05], [0.2, 1.0, -0.2]])
+    found = []
+    for view in views:
+        sensor = camera(1, 1, [0, 0, 0], view.tolist(), fov=1e-3, far_clip=1e8)
+        scene = {"type": "scene", "integrator": {"type": "atmosphere_path"}, "sky": sky, "sensor": sensor}
+        found.append(float(np.array(mi.render(mi.load_dict(scene), spp=1)).ravel()[0]))
+    fine = Sky(air, resolution=replace(Resolution.suited(air, 0.01), altitudes=96))
+    angles = np.arctan2(1.0, 0.4), np.arccos(views[:, 2] / np.linalg.norm(views, axis=1)), np.arctan2(0.2, 1.0)
+    rays = [doubles(np.broadcast_to(v, len(views))) for v in (42.0, *angles)]
+    expected = np.array(fine.rays(*rays).radiance[0]) * SpectralBasis.of(air).xyz_matrix[1, 0]
+    # The tolerance to which fields are solved.
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
 def test_aovs_split_the_picture(rgb):
     """In front of black shapes there is the air's light and nothing else; its transmittance is that of ``sky``."""
     scene = mi.load_dict(
