@@ -27,7 +27,7 @@ class Evaluation:
     """
 
     def __init__(self, sky: Sky, options: dict[str, Any]) -> None:
-        self._sky, self._options = sky.unlit, options
+        self._sky, self._options = sky.unlit(), options
         self._recordings = Recordings(sky.grid)
         self._recorded = all(optics.phase_kinds is not None for optics in (band.optics for band in sky.solutions))
 

@@ -116,12 +116,16 @@ class Sky:
         """The nodes that it is solved on."""
         return Grid.of(self.layout, self.resolution, self.suns, self.atmosphere)
 
-    @property
-    def unlit(self) -> Sky:
+    def unlit(self, atmosphere: Atmosphere | None = None) -> Sky:
         """This sky without its light, which ``again`` and its like do not ask for: what is kept for long holds no
-        tables of one solve."""
+        tables of one solve. ``atmosphere``: one of the same make-up with other profiles, met on the same nodes."""
         other = copy(self)
         other._bands = [_Band(band.optics, band.columns) for band in self._bands]
+        if atmosphere is not None:
+            other.atmosphere = atmosphere
+            for band in other._bands:
+                names = [band.optics.constituents[k].name for k in band.optics.scatterers]
+                band.optics = Optics(atmosphere, band.optics.indices, names)
         return other
 
     def columns_again(self, values: list[dict[str, Any]], known: list[Any] | None = None) -> list[Any]:

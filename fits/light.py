@@ -50,7 +50,7 @@ class RayLight:
         def made() -> Any:
             same = len(channels) == len(sky.atmosphere.wavelengths_nm)
             several = sky if same else Sky(side_by_side, None, sky.tolerance, sky.resolution, sky.suns, sky.layout)
-            return Recordings(grid), several.unlit, [band.optics for band in several.solutions]
+            return Recordings(grid), several.unlit(), [band.optics for band in several.solutions]
 
         self._recordings, self._sky, self._optics = grid.kept(("rays of fits", *key), made)
 

@@ -9,11 +9,10 @@ same shares of the orders, as derivatives of the solver are (docs/method.md, sec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from atmo_jit._trees import flat, like
@@ -68,12 +67,19 @@ class LinearizedSky:
             for end, sign in zip(ends, (-step, step), strict=True):
                 there = [leaf + sign * s for leaf, s in zip(flat(numbers), steps, strict=True)]
                 end.append(on_device(like(numbers, there)))
-                if any(name.rpartition(".")[2] in PROFILE or ".profile." in name for name in names):
-                    # What is kept with the grid for its profiles does not serve then; this is how a solve knows.
-                    dr.enable_grad(flat(end[-1]["profiles"]))
         shares = [band.field.shares for band in self.sky.solutions]
-        low, high = (self.sky.again(values, shares) for values in ends)
+        skies = self.sky, self.sky
+        of_profiles = (*PROFILE, "sun_angular_radius_deg")
+        if any(name.rpartition(".")[2] in of_profiles or ".profile." in name for name in names):
+            # What is kept with the grid is of its profiles: others have grids of their own, with the same nodes.
+            skies = tuple(self._among(names, own, sign * step) for sign in (-1.0, 1.0))
+        low, high = (sky.again(values, shares) for sky, values in zip(skies, ends, strict=True))
         return 2.0 * step, (low, high)
+
+    def _among(self, names: Iterable[str], changes: Mapping[str, Any], step: float) -> Sky:
+        """The sky, without its light, among the profiles of an atmosphere so far along ``changes``."""
+        moved = {name: described(self.atmosphere, name) + step * changes[name] for name in names}
+        return self.sky.unlit(self.atmosphere.replace({n: np.asarray(value).tolist() for n, value in moved.items()}))
 
     def _size(self, name: str) -> float:
         """What a step of a parameter is measured by: its largest number, for g also how far that is from 1."""
