@@ -17,8 +17,8 @@ from .resolution import Resolution
 from .views import check_views
 
 # Views of one observer and one sun from which a table of the sky pays: it has this many nodes, each a march.
-SUN_STEP_DEG = 2.0  # suns that are solved begin and end at multiples of it: the next sun then finds the same grid
 TABLE_NODES = 14_162
+SUN_STEP_DEG = 2.0  # suns that are solved begin and end at multiples of it: the next sun then finds the same grid
 
 
 @dataclass(frozen=True)
