@@ -68,7 +68,7 @@ class Airlight:
         dr.make_opaque(self.sun)
 
     def _take(self, sky: Sky) -> None:
-        self.bands = sky.bands
+        self.sky, self.bands = sky, sky.bands
         self.sources = [band.source and SourceTable(band.field) for band in self.bands]
 
     def moved(self, sky: Sky) -> Airlight:

@@ -17,9 +17,11 @@ from .colours import Colours
 from .exposed import array, host
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
+from .hidden_light import PASSES, HiddenLight
+from .lattice import Lattice
 from .linearized import Changes, LinearizedSky, unit_changes
 from .near_ground import near_ground
-from .shaded_air import later_orders
+from .open_sky import OpenSky
 from .shadow_volume import shadowed_interval
 from .skylight import Skylight
 from .volpath import mis_weight, unpolarized
@@ -149,6 +151,7 @@ class AtmospherePath:
             if name not in AOVS:
                 raise AtmosphereError("aovs", shown(name), f"{' and '.join(AOVS)}, separated by a comma")
         self._held: tuple[Any, ...] | None = None
+        self._hidden: tuple[Any, ...] | None = None
         self._solved: LinearizedSky | None = None
         self._moving: tuple[Skylight, Airlight, Colours] | None = None  # while a derivative is rendered
 
@@ -225,6 +228,7 @@ class AtmospherePath:
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> tuple[Any, Any, list[Any]]:
         light, air, colours = self._parts(scene)
+        hidden = self._hidden_light(scene, air)
         lamps = [e for e in scene.emitters() if e is not light.emitter]
         lamp_list = light.pointers(lamps)
         context = mi.BSDFContext()
@@ -251,19 +255,18 @@ class AtmospherePath:
             shows = active & (surface | (depth > 0) | ~mi.Bool(self.hide_emitters))
 
             grounded = active & part.ground & ~surface
-            inscatter, surfaces = self._inscatter(scene, sampler, ray, part, light, air, colours, passed, active)
+            inscatter = self._inscatter(scene, sampler, ray, part, light, air, hidden, active)
             lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
             disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
             disc = dr.select(active & ~surface & ~grounded, disc * light.sun_squeeze, 0.0)
             ground = air.on_ground(ray(part.distance), lit)
             arriving = light.sum(passed, inscatter, part.transmittance, ground, grounded, disc)
-            arriving = colours.of(arriving, ray.wavelengths) + surfaces * light.sky_scale
-            result += dr.select(shows, reflected * arriving, 0.0)
+            result += dr.select(shows, reflected * colours.of(arriving, ray.wavelengths), 0.0)
             seen |= shows
             passed = products(passed, part.transmittance)
             if dr.hint(len(self.aovs) > 0, mode="scalar"):
                 start = depth == 0
-                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths) + surfaces, first_light)
+                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths), first_light)
                 first_passed = dr.select(start, colours.white(part.transmittance, ray.wavelengths), first_passed)
 
             # Lamps that the ray meets.
@@ -340,14 +343,12 @@ class AtmospherePath:
         part: Any,
         light: Skylight,
         air: Airlight,
-        colours: Colours,
-        passed: list[Any],
+        hidden: HiddenLight | None,
         active: Any,
-    ) -> tuple[list[Any], Any]:
-        """What the air of a segment scatters, less what shapes keep from it (W); and what it scatters of their
-        surfaces' light, after the air that the path has ``passed``."""
+    ) -> list[Any]:
+        """What the air of a segment scatters, less what shapes keep from it (W)."""
         if not self._shades(scene, air):
-            return part.light, mi.UnpolarizedSpectrum(0.0)
+            return part.light
         toward = light.toward_sun(sampler.next_2d(active))
         start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
         sample = sampler.next_1d(active)
@@ -356,12 +357,29 @@ class AtmospherePath:
             return self._lit(scene, ray(distance), toward, active)
 
         missing = air.shade(part, start, end, sample, self.shaft_samples, lit)
-        surfaces = mi.UnpolarizedSpectrum(0.0)
-        if None not in air.sources:
-            most = None if self.orders is None else self.orders - 1
-            later, surfaces = later_orders(air, scene, sampler, ray, part, toward, passed, colours, most, active)
+        if hidden is not None:
+            later = hidden.missing(ray, part, sampler, active)
             missing = [a + b for a, b in zip(missing, later, strict=True)]
-        return [a - dr.minimum(b, MOST_HIDDEN * a) for a, b in zip(part.light, missing, strict=True)], surfaces
+        return [a - dr.minimum(b, MOST_HIDDEN * a) for a, b in zip(part.light, missing, strict=True)]
+
+    def _hidden_light(self, scene: Any, air: Airlight) -> HiddenLight | None:
+        """What shapes keep of later orders, made again where the air or the shapes changed."""
+        if not self._shades(scene, air) or None in air.sources:
+            return None
+        shapes = parameters_of(scene.shapes())
+        if self._hidden is None or self._hidden[0] is not air or not same(self._hidden[1], shapes):
+            lattice = Lattice(scene, air.globe, DEEPEST_M)
+            found = None
+            if lattice.found:
+                most = None if self.orders is None else self.orders - 1
+                skies = [air.sky]
+                if most is not None and self._moving is None:
+                    # Light that a shape hides has been scattered less often than all that the field may hold.
+                    skies = [Sky(air.sky.atmosphere, n) for n in range(most, max(most - PASSES, 0), -1)]
+                open_sky = OpenSky(skies, air.globe, scene.bbox(), np.array(air.sun).ravel())
+                found = HiddenLight(scene, air, lattice, open_sky, most)
+            self._hidden = air, shapes, found
+        return self._hidden[2]
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
@@ -410,3 +428,18 @@ class AtmospherePath:
 def products(one: list[Any], other: list[Any]) -> list[Any]:
     """Wavelength by wavelength."""
     return [a * b for a, b in zip(one, other, strict=True)]
+
+
+def parameters_of(shapes: list[Any]) -> list[Any]:
+    """The arrays that describe shapes and their surfaces."""
+    found = []
+    for shape in shapes:
+        found += [getattr(value, "array", value) for _, value in mi.traverse(shape)]
+    return found
+
+
+def same(one: list[Any], other: list[Any]) -> bool:
+    """Whether two lists hold the same arrays: what holds an array keeps others from its place in memory."""
+    return len(one) == len(other) and all(
+        a.index == b.index if hasattr(a, "index") else a is b or bool(a == b) for a, b in zip(one, other, strict=True)
+    )

@@ -1,0 +1,145 @@
+"""Where what shapes do to the air is known: nodes in the air among and above them, and directions on the sphere."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from atmo_jit.backend import table, types
+
+from .globe import Globe
+
+NODES = (40, 40, 12)  # along two level axes and up
+BINS = 64  # of the density of nodes along an axis
+EVEN = 0.3  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
+PROBES = 1 << 16  # rays that look for shapes
+SIDE = 13  # nodes along a side of the square that an octahedron unfolds to
+
+
+class Lattice:
+    """NODES in the box about the shapes of a ``scene``: denser where there is relief, and towards the lowest air.
+
+    Places are (a, b, h): metres along two level axes from the anchor of ``globe``, and altitude (m). Along each axis
+    the number of nodes below a place is a piecewise linear function of it. ``found``: whether any shape was met."""
+
+    def __init__(self, scene: Any, globe: Globe, deepest: float) -> None:
+        self._globe = globe
+        up = np.array(globe.up)
+        east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up)
+        self._axes = np.stack([east / np.linalg.norm(east), np.cross(up, east / np.linalg.norm(east))])
+        places, relief = self._probed(scene, deepest)
+        self.found = len(relief) > 0
+        if not self.found:
+            return
+        low, high = places.min(axis=0), places.max(axis=0)
+        low[2], high[2] = max(low[2], 0.0), max(high[2], 0.0)
+        tall = max(high[2] - low[2], 0.01 * float(np.max(high[:2] - low[:2])), 1e-3)
+        low[:2] -= tall
+        high += tall  # above the shapes the air changes as well
+        high[2] = min(high[2], globe.thickness)
+        self._low, self._size = low, high - low
+        even = np.linspace(0.0, 1.0, BINS + 1)
+        warps = []
+        for axis in range(2):
+            share, _ = np.histogram(places[:, axis], BINS, (low[axis], high[axis]), weights=relief)
+            total = share.sum()
+            share = np.full(BINS, 1.0 / BINS) if total <= 0.0 else EVEN / BINS + (1.0 - EVEN) * share / total
+            warps.append(np.concatenate([[0.0], np.cumsum(share)]) / share.sum())
+        warps.append(np.sqrt(even))
+        self._warps = table(np.stack([warp * count for warp, count in zip(warps, NODES, strict=True)]).ravel())
+        lines = [np.interp((np.arange(n) + 0.5) / n, warp, even) for warp, n in zip(warps, NODES, strict=True)]
+        a, b, self.h = (low[i] + self._size[i] * v for i, v in enumerate(np.meshgrid(*lines, indexing="ij")))
+        self.h = self.h.ravel()
+        self.count = self.h.size
+        self.points = self._points(a.ravel(), b.ravel(), self.h)
+
+    def _probed(self, scene: Any, deepest: float) -> tuple[np.ndarray, np.ndarray]:
+        """Places [N, 3] where rays from all over the box about the shapes meet one, and the sine of its slope."""
+        rng = np.random.default_rng(0)
+        box = scene.bbox()
+        low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+        start = low + (high - low) * rng.random((PROBES, 3))
+        d = rng.normal(size=(PROBES, 3))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*d.T.astype(np.float32)))
+        si = scene.ray_intersect(ray)
+        q, z = self._globe._relative(si.p)
+        met = np.array(si.is_valid() & (self._globe.altitude(si.p) > -deepest))
+        q, normal = np.array(q).T, np.array(si.n).T
+        places = np.column_stack([q @ self._axes.T, np.array(self._globe.altitude(si.p))])[met]
+        return places, np.linalg.norm(np.cross(normal, self._globe.up), axis=1)[met]
+
+    def _points(self, a: np.ndarray, b: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Scene points [N, 3] of places."""
+        radius, flat = self._globe.radius, a * a + b * b
+        z = (h * (2.0 * radius + h) - flat) / (np.sqrt(np.maximum((radius + h) ** 2 - flat, 0.0)) + radius)
+        away = a[:, None] * self._axes[0] + b[:, None] * self._axes[1] + z[:, None] * np.array(self._globe.up)
+        return np.array(self._globe.anchor) + away * self._globe.scale
+
+    def interval(self, ray: Any) -> tuple[Any, Any]:
+        """First and last distance (scene units) of a ray between the planes about the nodes; none: last < first."""
+        globe = self._globe
+        q, z = globe._relative(ray.o)
+        axes = [mi.Vector3f(*(float(v) for v in axis)) for axis in (*self._axes, globe.up)]
+        far = np.max(np.abs([self._low[:2], self._low[:2] + self._size[:2]]), axis=0)
+        sag = float(far @ far) / (2.0 * globe.radius)
+        low, high = self._low - [0.0, 0.0, sag], self._low + self._size
+        first, last = mi.Float(0.0), mi.Float(dr.inf)
+        for i, axis in enumerate(axes):
+            at, speed = (z if i == 2 else dr.dot(q, axis)), dr.dot(ray.d, axis)
+            inverse = 1.0 / dr.select(dr.abs(speed) > 1e-6, speed, dr.copysign(mi.Float(1e-6), speed))
+            ends = [(float(bound[i]) - at) * inverse for bound in (low, high)]
+            first, last = dr.maximum(first, dr.minimum(*ends)), dr.minimum(last, dr.maximum(*ends))
+        return first * globe.scale, last * globe.scale
+
+    def node(self, p: Any, h: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
+        """One of the eight nodes about a point of altitude ``h`` (m), the nearer one more often, so that its mean
+        interpolates; and whether the point lies among nodes."""
+        q, _ = self._globe._relative(p)
+        place = [dr.dot(q, mi.Vector3f(*(float(v) for v in axis))) for axis in self._axes] + [h]
+        index, inside = mi.UInt32(0), mi.Bool(True)
+        for i, count in enumerate(NODES):
+            x = (place[i] - float(self._low[i])) * (BINS / float(self._size[i]))
+            inside &= (x >= 0.0) & (x <= BINS)
+            x = dr.clip(x, 0.0, BINS)
+            bin_ = dr.minimum(mi.UInt32(x), BINS - 1)
+            below, above = (
+                dr.gather(types().Float, self._warps, bin_ + (i * (BINS + 1) + step), active) for step in (0, 1)
+            )
+            x = dr.lerp(below, above, x - mi.Float(bin_)) - 0.5 + sampler.next_1d(active)
+            index = index * count + dr.minimum(mi.UInt32(dr.maximum(x, 0.0)), count - 1)
+        return index, inside
+
+
+def unfolded_directions() -> np.ndarray:
+    """Unit vectors [SIDE * SIDE, 3] at the nodes of the square that an octahedron unfolds to."""
+    y, x = (v.ravel() for v in np.meshgrid(*[np.linspace(-1.0, 1.0, SIDE)] * 2, indexing="ij"))
+    z = 1.0 - np.abs(x) - np.abs(y)
+    folded = np.maximum(-z, 0.0)
+    d = np.stack([x - np.copysign(folded, x), y - np.copysign(folded, y), z], axis=-1)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def unfolded_node(d: Any, sampler: Any, active: Any) -> Any:
+    """One of the four of :func:`unfolded_directions` about a direction, the nearer one more often."""
+    inverse = 1.0 / (dr.abs(d.x) + dr.abs(d.y) + dr.abs(d.z))
+    x, y = d.x * inverse, d.y * inverse
+    down = d.z < 0.0
+    x, y = (
+        dr.select(down, dr.copysign(1.0 - dr.abs(y), x), x),
+        dr.select(down, dr.copysign(1.0 - dr.abs(x), y), y),
+    )
+    i, j = (
+        dr.minimum(mi.UInt32(dr.fma(0.5 * v + 0.5, SIDE - 1.0, sampler.next_1d(active))), SIDE - 1) for v in (x, y)
+    )
+    return j * SIDE + i
+
+
+def fibonacci(count: int, shift: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers in [0, 1) and angles (rad) that are even together."""
+    i = np.arange(count)
+    return (i + shift) / count, 2.0 * math.pi * ((i * 0.5 * (math.sqrt(5.0) - 1.0) + turn) % 1.0)
