@@ -21,9 +21,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import floats, row, table
+from atmo_jit.backend import floats, row, table, uints
 from atmo_jit.geometry import UPRIGHT
-from atmo_jit.march import Rays, point_along, rays_to_boundary, relative_azimuth, visible_sun
+from atmo_jit.march import point_along, rays_to_boundary, relative_azimuth, visible_sun
 from atmo_jit.phase import HenyeyGreenstein
 from atmo_jit.spectrum import SpectralBasis
 
@@ -33,11 +33,11 @@ from .cornette_shanks import henyey_greenstein_cosine
 from .lattice import NODES, Lattice, fibonacci, unfolded_directions, unfolded_node
 from .open_sky import OpenSky
 
-NORM = True
-SETS, ABOUT_SUN, AROUND = 16, 16, 48  # sets of directions, which nodes take in turn; about the sun, and all around
-PASSES = 4  # over all nodes, where orders have no limit
+SETS, ABOUT_SUN, AROUND = 64, 24, 72  # sets of directions, which nodes take in turn; about the sun, and all around
+PASSES = 3  # over all nodes, where orders have no limit
 OPEN = 0.02  # of the upper half of its directions, that a node in the air sees the sky in
 LEAST_RANGE = 1e-3  # of rate x length of a bounded path, where single precision resolves 1 - exp(-x)
+SHORTEST = 1e-3  # m: of paths on which a point is drawn
 POINTS = 4  # of each segment, at most, at which the table is read
 FULL_DEPTH = 0.25  # optical depth from which a segment gets all of its points
 FIRST_PARTS, PARTS = 4, 2  # of the quadrature of columns
@@ -54,33 +54,34 @@ class HiddenLight:
         count = lattice.count
         self._directions, weights = directions(np.array(air.sun).ravel(), float(np.array(air.asymmetry).ravel()[0]))
         per_node = self._directions.shape[1]
+        self._sets = np.random.default_rng(2).permutation(np.arange(count) % SETS)
         lane = dr.arange(mi.UInt32, count * per_node)
         node, j = lane // per_node, lane % per_node
-        points = table(lattice.points.astype(np.float32))
-        p = mi.Point3f(*row(points, node, 3))
-        d = mi.Vector3f(*row(table(self._directions.astype(np.float32)), (node % SETS) * per_node + j, 3))
+        chosen = dr.gather(mi.UInt32, uints(self._sets), node) * per_node + j
+        d = mi.Vector3f(*row(table(self._directions.astype(np.float32)), chosen, 3))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, count * per_node)
-        ray = self._ray(scene, p, d, sampler)
+        ray = self._ray(scene, lattice.around(node, scene, sampler), d, sampler)
         phases = self._phases(weights)
         shares = self._shares(lattice.h)
-        light = np.stack([np.array(v) for v in ray["single"]]), np.stack([np.array(v) for v in ray["factor"]])
         stands_for = self._standing(np.array(ray["leaves"]).reshape(count, per_node))
-        index, sides = np.array(ray["index"]), len(unfolded_directions())
-        index = stands_for[index // sides] * sides + index % sides
-        known = lit = None
+        near = dr.gather(mi.UInt32, uints(stands_for), ray["node"])
+        index = dr.fma(near, len(unfolded_directions()), ray["toward"])
+        lit, known = [], None
         for n in range(PASSES) if most is None else range(max(most - PASSES, 0), most):
-            lit = self._hidden(ray, n, most) if lit is None or most is not None else lit
-            total = lit + light[0]
+            if not lit or most is not None:
+                lit = self._hidden(ray, 0 if most is None else most - 1 - n)
+            light = lit
             if known is not None:
-                total += light[1] * known.reshape(air.count, -1)[:, index]
-            known = self._scattered(total.reshape(air.count, count, per_node), phases, shares)
-        self._table = table(np.moveaxis(known[:, stands_for], 0, -1).reshape(-1, air.count))
+                again = row(table(known), index, air.count)
+                light = [dr.fma(f, m, v) for f, m, v in zip(ray["factor"], again, lit, strict=True)]
+            dr.eval(light)
+            known = self._scattered(np.stack(light).reshape(air.count, count, per_node), phases, shares)
+        self._table = table(known[stands_for].reshape(-1, air.count))
 
     def _standing(self, leaves: np.ndarray) -> np.ndarray:
         """For each node one that is in the air, near it: itself where it sees the sky in OPEN of its upper half."""
-        count = len(leaves)
-        upper = (self._directions @ np.array(self._air.globe.up) > 0.0)[np.arange(count) % SETS]
+        upper = (self._directions @ np.array(self._air.globe.up) > 0.0)[self._sets]
         known = (leaves & upper).sum(axis=1) > OPEN * upper.sum(axis=1)
         return nearest(known.reshape(NODES))
 
@@ -101,7 +102,7 @@ class HiddenLight:
 
         # One point of the air on the way.
         _, last = self._lattice.interval(mi.Ray3f(p, d))
-        length = dr.minimum(dr.select(behind, near, line.stop), last * (1.0 / scale))
+        length = dr.maximum(dr.minimum(dr.select(behind, near, line.stop), last * (1.0 / scale)), SHORTEST)
         rate = dr.maximum(air.guide.largest_extinction(air.guide.densities(h)), LEAST_EXTINCTION)
         rate = dr.maximum(rate, LEAST_RANGE / length)
         whole = 1.0 - dr.exp(-rate * length)
@@ -123,10 +124,10 @@ class HiddenLight:
                 single.append(seen * sun[c] * sum(o.scattering[k][c] * here[k] * sunward[k][c] for k in o.scatterers))
                 factor.append(seen * sum(o.scattering[k][c] * here[k] for k in o.scatterers))
         node, inside = self._lattice.node(place, there, sampler, active)
-        index = node * len(unfolded_directions()) + unfolded_node(d, sampler, active)
+        toward = unfolded_node(d, sampler, active)
         factor = [dr.select(inside, f, 0.0) for f in factor]
 
-        # What a shape hides, and what its surface sends: diffuse, lit by the sun and by what its slope leaves of the sky.
+        # What a shape hides, and what its surface sends: diffuse, lit by the sun and by what its slope leaves of sky.
         h, r, mu_s = point_along(optics, line, near)
         mu = dr.clip(dr.fma(optics.radius + line.h, line.mu, near) / r, -UPRIGHT, UPRIGHT)
         n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)
@@ -142,20 +143,20 @@ class HiddenLight:
                 c += 1
         found = {
             "leaves": ~behind & ~line.ground, "behind": behind, "through": through, "single": single, "factor": factor,
-            "index": index, "sent": sent, "h": h, "mu_s": mu_s, "mu": mu,
+            "node": node, "toward": toward, "sent": sent, "h": h, "mu_s": mu_s, "mu": mu,
             "azimuth": relative_azimuth(mu, mu_s, line.nu), "picks": (sampler.next_1d(), sampler.next_1d()),
         }
         dr.eval(found)
         return found
 
-    def _hidden(self, ray: dict[str, Any], n: int, most: int | None) -> np.ndarray:
-        """Radiance [W, rays] that shapes keep from nodes after ``n`` scatterings there may be (fewer than ``most``)."""
-        level = 0 if most is None else most - 1 - n
+    def _hidden(self, ray: dict[str, Any], level: int) -> list[Any]:
+        """Radiance (W) that shapes keep from nodes, but for what is hidden of light that the air before them scatters
+        once more; ``level``: of the open sky."""
         open_ = self._open_sky.radiance(
             mi.UInt32(level), *(ray[k] for k in ("h", "mu_s", "mu", "azimuth")), *ray["picks"], ray["behind"]
         )
-        parts = zip(ray["through"], open_, ray["sent"], strict=True)
-        return np.stack([np.array(t * (o - s)) for t, o, s in parts])
+        parts = zip(ray["through"], open_, ray["sent"], ray["single"], strict=True)
+        return [dr.fma(t, o - s, single) for t, o, s, single in parts]
 
     def _reflectance(self, si: Any, active: Any) -> list[Any]:
         """Diffuse reflectance at each wavelength: in RGB that of the channels which the wavelength counts in."""
@@ -185,7 +186,7 @@ class HiddenLight:
                 for k in band.optics.scatterers:
                     value = band.optics.phase_values(k, floats(cosine))[c] + mi.Float(0.0)
                     share = np.array(value, dtype=np.float32).reshape(cosine.shape) * weights[..., None]
-                    of_kinds.append((share / (share.sum(axis=1, keepdims=True) if NORM else 1.0)).astype(np.float32))
+                    of_kinds.append((share / share.sum(axis=1, keepdims=True)).astype(np.float32))
                 found.append(np.concatenate(of_kinds, axis=1))
         return found
 
@@ -201,13 +202,14 @@ class HiddenLight:
         return (found / np.maximum(found.sum(axis=0), 1e-30)).astype(np.float32)
 
     def _scattered(self, light: np.ndarray, phases: list[np.ndarray], shares: np.ndarray) -> np.ndarray:
-        """Light [W, nodes, directions] scattered once more: [W, nodes, directions of light]."""
+        """Light [W, nodes, directions] scattered once more: [nodes, directions of light, W]."""
         wavelengths, count, _ = light.shape
-        found = np.empty((wavelengths, count, phases[0].shape[-1]), dtype=np.float32)
-        for c in range(wavelengths):
-            for s in range(SETS):
-                of_kinds = [light[c, s::SETS] * share[s::SETS, None, c] for share in shares]
-                found[c, s::SETS] = np.concatenate(of_kinds, axis=1) @ phases[c][s]
+        found = np.empty((count, phases[0].shape[-1], wavelengths), dtype=np.float32)
+        for s in range(SETS):
+            own = np.flatnonzero(self._sets == s)
+            for c in range(wavelengths):
+                of_kinds = [light[c, own] * share[own, None, c] for share in shares]
+                found[own, :, c] = np.concatenate(of_kinds, axis=1) @ phases[c][s]
         return found
 
     def missing(self, ray: Any, part: Stretch, sampler: Any, active: Any) -> list[Any]:
@@ -249,12 +251,12 @@ class HiddenLight:
 
 
 def directions(sun: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors [SETS, N, 3], some about the ``sun``, and their weights (sr) in a mean over the sphere: one over N
-    times the density."""
+    """Unit vectors [SETS, N, 3], some about the ``sun``, and their weights (sr): one over how many there are in a
+    steradian."""
     rng, lobe = np.random.default_rng(1), HenyeyGreenstein(g)
     axis = np.cross(sun, [1.0, 0.0, 0.0] if abs(sun[0]) < 0.9 else [0.0, 1.0, 0.0])
     x = axis / np.linalg.norm(axis)
-    frame, count = np.stack([x, np.cross(sun, x), sun]), ABOUT_SUN + AROUND
+    frame = np.stack([x, np.cross(sun, x), sun])
     found = []
     for _ in range(SETS):
         parts = []
@@ -267,7 +269,7 @@ def directions(sun: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
         found.append(np.concatenate([parts[0] @ frame, parts[1] @ turn]))
     w = np.stack(found)
     density = ABOUT_SUN * np.asarray(lobe.value(np.clip(w @ sun, -1.0, 1.0))) + AROUND * 0.25 / np.pi
-    return w, 1.0 / (density * 1.0)
+    return w, 1.0 / density
 
 
 def nearest(known: np.ndarray) -> np.ndarray:

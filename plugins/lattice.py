@@ -9,14 +9,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import table, types
+from atmo_jit.backend import row, table, types
 
 from .globe import Globe
 
-NODES = (40, 40, 12)  # along two level axes and up
-BINS = 64  # of the density of nodes along an axis
-EVEN = 0.3  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
+NODES = (48, 48, 16)  # along two level axes and up
+BINS = 128  # of the density of nodes along an axis
+EVEN = 0.35  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
 PROBES = 1 << 16  # rays that look for shapes
+AROUND = 3.0  # of the size of all shapes, the air beside them
 SIDE = 13  # nodes along a side of the square that an octahedron unfolds to
 
 
@@ -24,9 +25,10 @@ class Lattice:
     """NODES in the box about the shapes of a ``scene``: denser where there is relief, and towards the lowest air.
 
     Places are (a, b, h): metres along two level axes from the anchor of ``globe``, and altitude (m). Along each axis
-    the number of nodes below a place is a piecewise linear function of it. ``found``: whether any shape was met."""
+    the number of nodes below a place is a piecewise linear function of it. ``sun``: unit vector towards it; ``reach`` (m): a free path in the densest
+    air. Shapes ``deepest`` below the planet's ground do not count. ``found``: whether any was met."""
 
-    def __init__(self, scene: Any, globe: Globe, deepest: float) -> None:
+    def __init__(self, scene: Any, globe: Globe, deepest: float, sun: np.ndarray, reach: float) -> None:
         self._globe = globe
         up = np.array(globe.up)
         east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up)
@@ -37,10 +39,12 @@ class Lattice:
             return
         low, high = places.min(axis=0), places.max(axis=0)
         low[2], high[2] = max(low[2], 0.0), max(high[2], 0.0)
-        tall = max(high[2] - low[2], 0.01 * float(np.max(high[:2] - low[:2])), 1e-3)
-        low[:2] -= tall
-        high += tall  # above the shapes the air changes as well
-        high[2] = min(high[2], globe.thickness)
+        # The air beside and above them changes as well, the more so in their shadow.
+        tall, wide = float(high[2] - low[2]), float(np.max(high - low))
+        shadow = tall * float(np.linalg.norm(np.cross(sun, up))) / max(float(sun @ up), 1e-3)
+        low[:2] -= min(max(AROUND * wide, shadow), reach)
+        high[:2] += min(max(AROUND * wide, shadow), reach)
+        high[2] = min(high[2] + min(max(AROUND * tall, 0.01 * wide), reach), globe.thickness)
         self._low, self._size = low, high - low
         even = np.linspace(0.0, 1.0, BINS + 1)
         warps = []
@@ -55,7 +59,10 @@ class Lattice:
         a, b, self.h = (low[i] + self._size[i] * v for i, v in enumerate(np.meshgrid(*lines, indexing="ij")))
         self.h = self.h.ravel()
         self.count = self.h.size
-        self.points = self._points(a.ravel(), b.ravel(), self.h)
+        points = self._points(a.ravel(), b.ravel(), self.h)
+        gaps = [size * np.gradient(v) for size, v in zip(self._size, lines, strict=True)]
+        gaps = [v.ravel() for v in np.meshgrid(*gaps, indexing="ij")]
+        self._nodes = table(np.column_stack([points, *gaps]).astype(np.float32))
 
     def _probed(self, scene: Any, deepest: float) -> tuple[np.ndarray, np.ndarray]:
         """Places [N, 3] where rays from all over the box about the shapes meet one, and the sine of its slope."""
@@ -79,6 +86,18 @@ class Lattice:
         z = (h * (2.0 * radius + h) - flat) / (np.sqrt(np.maximum((radius + h) ** 2 - flat, 0.0)) + radius)
         away = a[:, None] * self._axes[0] + b[:, None] * self._axes[1] + z[:, None] * np.array(self._globe.up)
         return np.array(self._globe.anchor) + away * self._globe.scale
+
+    def around(self, node: Any, scene: Any, sampler: Any) -> Any:
+        """Points about nodes, as near as the weights of linear interpolation fall off, with nothing between."""
+        p = mi.Point3f(*row(self._nodes, node, 3, 6))
+        gaps = row(self._nodes, node, 6)[3:]
+        steps = [gap * (sampler.next_1d() + sampler.next_1d() - 1.0) * self._globe.scale for gap in gaps]
+        axes = (*self._axes, self._globe.up)
+        offset = sum(mi.Vector3f(*(float(v) for v in axis)) * step for axis, step in zip(axes, steps, strict=True))
+        length = dr.norm(offset)
+        d = offset * (1.0 / dr.maximum(length, 1e-30))
+        si = scene.ray_intersect_preliminary(mi.Ray3f(p, d), coherent=False)
+        return p + d * dr.select(si.t < length, si.t * sampler.next_1d(), length)
 
     def interval(self, ray: Any) -> tuple[Any, Any]:
         """First and last distance (scene units) of a ray between the planes about the nodes; none: last < first."""

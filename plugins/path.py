@@ -368,18 +368,23 @@ class AtmospherePath:
             return None
         shapes = parameters_of(scene.shapes())
         if self._hidden is None or self._hidden[0] is not air or not same(self._hidden[1], shapes):
-            lattice = Lattice(scene, air.globe, DEEPEST_M)
-            found = None
-            if lattice.found:
-                most = None if self.orders is None else self.orders - 1
-                skies = [air.sky]
-                if most is not None and self._moving is None:
-                    # Light that a shape hides has been scattered less often than all that the field may hold.
-                    skies = [Sky(air.sky.atmosphere, n) for n in range(most, max(most - PASSES, 0), -1)]
-                open_sky = OpenSky(skies, air.globe, scene.bbox(), np.array(air.sun).ravel())
-                found = HiddenLight(scene, air, lattice, open_sky, most)
-            self._hidden = air, shapes, found
+            with dr.suspend_grad():
+                self._hidden = air, shapes, self._hidden_anew(scene, air)
         return self._hidden[2]
+
+    def _hidden_anew(self, scene: Any, air: Airlight) -> HiddenLight | None:
+        sun = np.array(air.sun, dtype=np.float64).ravel()
+        lattice = Lattice(scene, air.globe, DEEPEST_M, sun, 1.0 / air.densest)
+        if not lattice.found:
+            return None
+        most, skies = None, [air.sky]
+        if self.orders is not None:
+            most = self.orders - 1
+            if self._moving is None:
+                # Light that a shape hides has been scattered less often than all that the field may hold.
+                skies = [Sky(air.sky.atmosphere, n) for n in range(most, max(most - PASSES, 0), -1)]
+        open_sky = OpenSky(skies, air.globe, scene.bbox(), sun)
+        return HiddenLight(scene, air, lattice, open_sky, most)
 
     def _shades(self, scene: Any, air: Airlight) -> bool:
         """Whether the shadows of shapes matter to the air."""
