@@ -30,10 +30,10 @@ from atmo_jit.spectrum import SpectralBasis
 from .airlight import LEAST_EXTINCTION, STEP, Airlight, Stretch
 from .channels import Channels
 from .cornette_shanks import henyey_greenstein_cosine
-from .lattice import NODES, Lattice, fibonacci, unfolded_directions, unfolded_node
+from .lattice import Lattice, fibonacci, unfolded_directions, unfolded_node
 from .open_sky import OpenSky
 
-SETS, ABOUT_SUN, AROUND = 64, 24, 72  # sets of directions, which nodes take in turn; about the sun, and all around
+SETS, ABOUT_SUN, AROUND = 64, 48, 80  # sets of directions, which nodes take in turn; about the sun, and all around
 PASSES = 3  # over all nodes, where orders have no limit
 OPEN = 0.02  # of the upper half of its directions, that a node in the air sees the sky in
 LEAST_RANGE = 1e-3  # of rate x length of a bounded path, where single precision resolves 1 - exp(-x)
@@ -83,7 +83,7 @@ class HiddenLight:
         """For each node one that is in the air, near it: itself where it sees the sky in OPEN of its upper half."""
         upper = (self._directions @ np.array(self._air.globe.up) > 0.0)[self._sets]
         known = (leaves & upper).sum(axis=1) > OPEN * upper.sum(axis=1)
-        return nearest(known.reshape(NODES))
+        return nearest(known.reshape(self._lattice.shape), self._lattice.lines)
 
     def _ray(self, scene: Any, p: Any, d: Any, sampler: Any) -> dict[str, Any]:
         """Of rays from nodes: what is known of each whatever the order."""
@@ -142,9 +142,19 @@ class HiddenLight:
                 sent.append(reflectance[c] * dr.fma(e, facing, s * openness) * dr.inv_pi)
                 c += 1
         found = {
-            "leaves": ~behind & ~line.ground, "behind": behind, "through": through, "single": single, "factor": factor,
-            "node": node, "toward": toward, "sent": sent, "h": h, "mu_s": mu_s, "mu": mu,
-            "azimuth": relative_azimuth(mu, mu_s, line.nu), "picks": (sampler.next_1d(), sampler.next_1d()),
+            "leaves": ~behind & ~line.ground,
+            "behind": behind,
+            "through": through,
+            "single": single,
+            "factor": factor,
+            "node": node,
+            "toward": toward,
+            "sent": sent,
+            "h": h,
+            "mu_s": mu_s,
+            "mu": mu,
+            "azimuth": relative_azimuth(mu, mu_s, line.nu),
+            "picks": (sampler.next_1d(), sampler.next_1d()),
         }
         dr.eval(found)
         return found
@@ -272,17 +282,19 @@ def directions(sun: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
     return w, 1.0 / density
 
 
-def nearest(known: np.ndarray) -> np.ndarray:
-    """Flat index of a ``known`` node for every node: itself, or one that is reached from neighbour to neighbour."""
-    found, known = np.arange(known.size).reshape(known.shape), known.copy()
-    for _ in range(sum(known.shape)):
-        if known.all() or not known.any():
-            break
-        before = known.copy()
-        for axis in (2, 0, 1):  # upwards first
+def nearest(known: np.ndarray, lines: list[np.ndarray]) -> np.ndarray:
+    """Flat index of a ``known`` node for every node: itself, or the nearest, along the ``lines`` (m) of the nodes."""
+    found = np.arange(known.size).reshape(known.shape)
+    distance = np.where(known, 0.0, np.inf)
+    changed = True
+    while changed:
+        changed = False
+        for axis, line in enumerate(lines):
+            gap = np.diff(line).reshape([-1 if a == axis else 1 for a in range(3)])
             for to, of in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
                 at, there = ((slice(None),) * axis + (part,) for part in (to, of))
-                takes = ~known[at] & before[there]
+                takes = distance[there] + gap < distance[at]
                 found[at] = np.where(takes, found[there], found[at])
-                known[at] |= takes
+                distance[at] = np.where(takes, distance[there] + gap, distance[at])
+                changed |= bool(takes.any())
     return found.ravel()

@@ -9,26 +9,34 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import row, table, types
+from atmo_jit.backend import row, row_size, table, types
 
 from .globe import Globe
 
-NODES = (48, 48, 16)  # along two level axes and up
+NODES = (48, 48, 16)  # along two level axes and up, at most
+MOST_NUMBERS = 5e7  # by node, direction and wavelength: more wavelengths have fewer nodes
 BINS = 128  # of the density of nodes along an axis
-EVEN = 0.35  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
+EVEN = 0.6  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
 PROBES = 1 << 16  # rays that look for shapes
+SPREAD = 1.0  # of the height of all shapes, the air that is known as finely as that among them
 AROUND = 3.0  # of the size of all shapes, the air beside them
-SIDE = 13  # nodes along a side of the square that an octahedron unfolds to
+SIDE = 19  # nodes along a side of the square that an octahedron unfolds to
 
 
 class Lattice:
-    """NODES in the box about the shapes of a ``scene``: denser where there is relief, and towards the lowest air.
+    """At most NODES in the air among, above and beside the shapes of a ``scene``: denser where there is relief, and
+    towards the lowest air.
 
     Places are (a, b, h): metres along two level axes from the anchor of ``globe``, and altitude (m). Along each axis
-    the number of nodes below a place is a piecewise linear function of it. ``sun``: unit vector towards it; ``reach`` (m): a free path in the densest
-    air. Shapes ``deepest`` below the planet's ground do not count. ``found``: whether any was met."""
+    the number of nodes below a place is a piecewise linear function of it. ``sun``: unit vector towards it;
+    ``reach`` (m): a free path in the densest air. Shapes ``deepest`` (m) below the planet's ground do not count.
+    ``found``: whether any was met."""
 
-    def __init__(self, scene: Any, globe: Globe, deepest: float, sun: np.ndarray, reach: float) -> None:
+    def __init__(
+        self, scene: Any, globe: Globe, deepest: float, sun: np.ndarray, reach: float, wavelengths: int
+    ) -> None:
+        numbers = float(np.prod(NODES)) * SIDE * SIDE * row_size(wavelengths)
+        self.shape = tuple(max(int(n * min((MOST_NUMBERS / numbers) ** (1.0 / 3.0), 1.0)), 4) for n in NODES)
         self._globe = globe
         up = np.array(globe.up)
         east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [0.0, 0.0, 1.0], up)
@@ -50,17 +58,21 @@ class Lattice:
         warps = []
         for axis in range(2):
             share, _ = np.histogram(places[:, axis], BINS, (low[axis], high[axis]), weights=relief)
+            # Also where relief is as near as it is high.
+            near = max(round(SPREAD * tall * BINS / self._size[axis]), 0)
+            share = np.convolve(share, np.bartlett(2 * near + 3), mode="same")
             total = share.sum()
             share = np.full(BINS, 1.0 / BINS) if total <= 0.0 else EVEN / BINS + (1.0 - EVEN) * share / total
             warps.append(np.concatenate([[0.0], np.cumsum(share)]) / share.sum())
         warps.append(np.sqrt(even))
-        self._warps = table(np.stack([warp * count for warp, count in zip(warps, NODES, strict=True)]).ravel())
-        lines = [np.interp((np.arange(n) + 0.5) / n, warp, even) for warp, n in zip(warps, NODES, strict=True)]
+        self._warps = table(np.stack([warp * count for warp, count in zip(warps, self.shape, strict=True)]).ravel())
+        lines = [np.interp((np.arange(n) + 0.5) / n, warp, even) for warp, n in zip(warps, self.shape, strict=True)]
+        self.lines = [size * v for size, v in zip(self._size, lines, strict=True)]
         a, b, self.h = (low[i] + self._size[i] * v for i, v in enumerate(np.meshgrid(*lines, indexing="ij")))
         self.h = self.h.ravel()
         self.count = self.h.size
         points = self._points(a.ravel(), b.ravel(), self.h)
-        gaps = [size * np.gradient(v) for size, v in zip(self._size, lines, strict=True)]
+        gaps = [np.gradient(v) for v in self.lines]
         gaps = [v.ravel() for v in np.meshgrid(*gaps, indexing="ij")]
         self._nodes = table(np.column_stack([points, *gaps]).astype(np.float32))
 
@@ -121,7 +133,7 @@ class Lattice:
         q, _ = self._globe._relative(p)
         place = [dr.dot(q, mi.Vector3f(*(float(v) for v in axis))) for axis in self._axes] + [h]
         index, inside = mi.UInt32(0), mi.Bool(True)
-        for i, count in enumerate(NODES):
+        for i, count in enumerate(self.shape):
             x = (place[i] - float(self._low[i])) * (BINS / float(self._size[i]))
             inside &= (x >= 0.0) & (x <= BINS)
             x = dr.clip(x, 0.0, BINS)
@@ -152,9 +164,7 @@ def unfolded_node(d: Any, sampler: Any, active: Any) -> Any:
         dr.select(down, dr.copysign(1.0 - dr.abs(y), x), x),
         dr.select(down, dr.copysign(1.0 - dr.abs(x), y), y),
     )
-    i, j = (
-        dr.minimum(mi.UInt32(dr.fma(0.5 * v + 0.5, SIDE - 1.0, sampler.next_1d(active))), SIDE - 1) for v in (x, y)
-    )
+    i, j = (dr.minimum(mi.UInt32(dr.fma(0.5 * v + 0.5, SIDE - 1.0, sampler.next_1d(active))), SIDE - 1) for v in (x, y))
     return j * SIDE + i
 
 

@@ -29,8 +29,8 @@ from .volpath import mis_weight, unpolarized
 # Shapes lie in valleys at most this deep (m): below it the planet's ground hides them.
 DEEPEST_M = 500.0
 LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
-# Of a segment's light, that shapes may hide in one sample: the few walks that weigh most would leave black specks. A
-# bound of 1 would make shadows too bright.
+# Of a segment's light, that shapes may hide in one sample: those that weigh most would leave black specks. A bound of
+# 1 would make shadows too bright.
 MOST_HIDDEN = 2.0
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
 SCALES = ("sun_scale", "sky_scale")
@@ -77,8 +77,7 @@ class AtmospherePath:
 
      * - orders
        - |int|
-       - How often light is scattered in the air or reflected by the planet's ground, at most. With 3 or
-         more, but a limit, shapes take away too much: the field behind them has orders of its own. (Default: no limit)
+       - How often light is scattered in the air or reflected by the planet's ground, at most. (Default: no limit)
 
      * - shaft_samples
        - |int|
@@ -95,10 +94,12 @@ class AtmospherePath:
     surface to the next, and to the camera, the air takes its part of the light and adds what it scatters. That is
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
-    points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders that shapes
-    keep from a segment, and that their surfaces add, is found by random walks from points of it, with noise, but
-    hardly a bias (docs/gallery.md has both). Two things in it are simplified: surfaces count as diffuse, and of the sky
-    they see what their slope leaves of it, whatever else is in the way.
+    points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders
+    that shapes keep from the air, less what their surfaces add, is a table that is made once, with 4.7 million rays
+    from 37 thousand points among, above and beside the shapes; it is made again when air or shapes change. Pictures
+    have no noise from it, but a bias close to shapes that hide most of the light (docs/method.md, docs/gallery.md).
+    Two things in it are simplified: surfaces count as diffuse, and of the sky they see what their slope leaves of it,
+    whatever else is in the way.
 
     Behind the shapes is the planet's own ground, with the atmosphere's ``ground_albedo``, on which shapes cast shadows
     of the sun (but do not occlude the sky). Cameras may be in the air or in space.
@@ -374,7 +375,7 @@ class AtmospherePath:
 
     def _hidden_anew(self, scene: Any, air: Airlight) -> HiddenLight | None:
         sun = np.array(air.sun, dtype=np.float64).ravel()
-        lattice = Lattice(scene, air.globe, DEEPEST_M, sun, 1.0 / air.densest)
+        lattice = Lattice(scene, air.globe, DEEPEST_M, sun, 1.0 / air.densest, air.count)
         if not lattice.found:
             return None
         most, skies = None, [air.sky]
