@@ -36,8 +36,8 @@ Left the scene's own integrator with the solved atmosphere, right the same scene
 {square} x {square} pixels, in per cent of the green channel; "beyond 3 sigma" is the 95th percentile of what they
 exceed three standard errors by. "gain" is how many times less processor time the left picture takes for the same noise.
 
-Light of order 2 and more that shapes keep from the air is found by random walks (docs/method.md), which are most of the
-noise where the air is thick. "shaded" are squares that shafts
+Light of order 2 and more that shapes keep from the air is read from a table (docs/method.md), whose bias is that of the
+last column. Making it, once for a scene, does not count in the gain. "shaded" are squares that shafts
 and shadows change by more than {shaded:g} %, "clear" the others: the last columns have, of these, what "p95 beyond 3
 sigma" is of all, and of those the mean difference.
 
