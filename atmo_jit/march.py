@@ -69,16 +69,19 @@ class Source(Protocol):
         """Integral of phase function times radiance over all directions, toward (mu, phi): [scatterer][channel]."""
 
 
-def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
-    """Rays from ``h`` to whatever they meet first, the ground or the top, in the precision of ``h``.
+def rays_to_boundary(
+    optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any, planet: tuple[Any, Any] | None = None
+) -> Rays:
+    """Rays from ``h`` to whatever they meet first, the ground or the top, in the precision of ``h``; ``planet``: its
+    radius and thickness of air in that precision.
 
     That is decided in it too: in single precision a ray 1e-7 rad off the horizon may be taken for one
     on its other side, which sees other light.
     """
     t, wide = types(), type(h)
-    radius = wide(optics.radius)
+    radius, top = planet or (wide(optics.radius), wide(optics.thickness))
     ground = hits_ground(radius, h, mu)
-    stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, wide(optics.thickness)))
+    stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, top))
     return Rays(h, mu, mu_s, nu, stop, t.Bool(ground))
 
 
