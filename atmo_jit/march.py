@@ -368,7 +368,13 @@ def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
         level = dr.gather(type(breaks), breaks, i)
         return (level < rays.h) | (~falling & (level <= rays.h))
 
-    index = dr.binary_search(0, count - 1, below)
+    # dr.binary_search, which compiles the number of breaks.
+    index, end = t.UInt(0), t.UInt(last) + 1
+    for _ in range(count.bit_length()):
+        middle = (index + end) >> 1
+        under = below(middle)
+        index = dr.select(under, dr.minimum(middle + 1, end), index)
+        end = dr.select(under, end, middle)
     return dr.clip(t.Float(index) - 1.0, 0.0, last)
 
 
