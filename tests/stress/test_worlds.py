@@ -137,3 +137,17 @@ def test_rays_from_space_pass_as_low_as_they_do(radius, height):
     out = sky.rays(lowest, np.zeros(3), np.full(3, 0.5 * np.pi), np.zeros(3)).transmittance[0].numpy()
     across = sky.rays(up, np.zeros(3), np.pi - far, np.zeros(3)).transmittance[0].numpy()
     assert across == pytest.approx(out**2, abs=2e-6)
+
+
+# 0.05 and 4e-3 off with four nodes to a piece of the ray.
+@pytest.mark.parametrize(
+    ("number", "altitude", "sun", "view", "off"),
+    [(64, 73_190.8235198, 92.6189536286, 90.0, 5e-3), (16, 4285.36188, 94.501944, 0.0, 1e-3)],
+)
+def test_sunlight_that_grazes_a_step_of_density(number, altitude, sun, view, off):
+    air = extreme_world(Random(number))
+    h, zenith, toward = np.array([altitude]), np.radians([sun]), np.radians([view])
+    found = [v.numpy() for v in atmo_jit.Sky(air, 1).rays(h, zenith, toward, np.zeros(1), ground=False).radiance]
+    nu = np.cos(zenith - toward)
+    want = Twin(air, tolerance=1e-6).single_scattering(h, np.cos(toward), np.cos(zenith), nu)[0]
+    assert np.ravel(found) == pytest.approx(want, rel=off)
