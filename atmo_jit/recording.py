@@ -53,8 +53,8 @@ class Recordings:
 
 
 def _given_back(result: Any) -> Any:
-    """The result, after the memory that only tracing needed was given back: Dr.Jit keeps what was freed by its size, and
-    playing back needs other sizes."""
+    """The result, after the memory that only tracing needed was given back: Dr.Jit keeps what is free in pieces of the
+    sizes that were asked for, and playing back asks for others."""
     dr.sync_thread()
     dr.flush_malloc_cache()
     return result
