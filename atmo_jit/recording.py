@@ -34,10 +34,9 @@ class Recordings:
         if key not in self._used:
             self._used.add(key)
             if prepare is None:
-                return _given_back(function(*arguments))
+                return function(*arguments)
             prepare(*arguments)
-        new = key not in self._recorded
-        if new:
+        if key not in self._recorded:
             arrays = arrays_in(self._keepers)
             self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
         # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
@@ -45,19 +44,10 @@ class Recordings:
         collects = gc.isenabled()
         gc.disable()
         try:
-            result = self._recorded[key](*arguments)
-            return _given_back(result) if new else result
+            return self._recorded[key](*arguments)
         finally:
             if collects:
                 gc.enable()
-
-
-def _given_back(result: Any) -> Any:
-    """The result, after the memory that only tracing needed was given back: Dr.Jit keeps what is free in pieces of the
-    sizes that were asked for, and playing back asks for others."""
-    dr.sync_thread()
-    dr.flush_malloc_cache()
-    return result
 
 
 def copied(tree: Any) -> Any:

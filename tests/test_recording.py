@@ -10,7 +10,6 @@ from atmo_jit.column import sun_columns
 from atmo_jit.grid import Grid
 from atmo_jit.multiple_scattering import solve
 from atmo_jit.optics import Optics
-from atmo_jit.recording import Recordings
 from atmo_jit.resolution import Resolution
 
 EARTH = atmo_jit.Atmosphere.load("earth")
@@ -77,27 +76,3 @@ def test_derivatives_pass_through_a_solve_on_a_recorded_grid():
     step = 0.02
     ends = [light(solved(EARTH, scaled(1.0 + sign * step), orders=2)).numpy()[0] for sign in (1, -1)]
     assert dr.grad(irradiance).numpy()[0] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)
-
-
-def test_tracing_leaves_no_memory_behind():
-    """What a call needs in between is not kept for later ones when it was plain or recorded."""
-    mib = 2**20
-
-    def function(values):
-        parts = [values + float(i) for i in range(1, 5)]  # 16 MiB each
-        dr.eval(parts)
-        return dr.sum(sum(parts))
-
-    def held():
-        dr.sync_thread()
-        dr.detail.malloc_clear_statistics()
-        return dr.detail.malloc_watermark(dr.backend_v(types().Float)) / mib
-
-    values = dr.arange(types().Float, 4 * mib)
-    dr.eval(values)
-    dr.sync_thread()
-    dr.flush_malloc_cache()
-    before, recordings = held(), Recordings()
-    for _ in range(2):
-        recordings.run("sum", function, values)
-        assert held() < before + 1.0
