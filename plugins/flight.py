@@ -83,7 +83,7 @@ def flight(air: Air, ray: Any, reach: Any) -> Flight:
     """The part of a ray that is in the air, up to ``reach`` (scene units; infinite: as far as there is air)."""
     radius, top = air.radius, air.thickness
     hits, near, far, _ = air.along(ray)
-    q, z = air._relative(ray.o)
+    q, z = air.relative(ray.o)
     h = air._altitude(q, z)
     r_mu = dr.fma(radius, dr.dot(ray.d, mi.Vector3f(*air.up)), dr.dot(q, ray.d))
     near, far = near * (1.0 / air.scale), far * (1.0 / air.scale)

@@ -30,14 +30,14 @@ class Globe:
         self.up = [float(v) for v in up]
         self.anchor = [float(v) for v in center + up * self.radius * scale]
 
-    def _relative(self, p: Any) -> tuple[Any, Any]:
-        """``p`` in metres from the anchor, and its component along the anchor's vertical."""
+    def relative(self, p: Any) -> tuple[Any, Any]:
+        """A point in metres from the anchor, and its component along the anchor's vertical."""
         q = mi.Vector3f(*((p[i] - self.anchor[i]) * (1.0 / self.scale) for i in range(3)))
         return q, q[0] * self.up[0] + q[1] * self.up[1] + q[2] * self.up[2]
 
     def altitude(self, p: Any) -> Any:
         """Altitude (m) of a point."""
-        return self._altitude(*self._relative(p))
+        return self._altitude(*self.relative(p))
 
     def _altitude(self, q: Any, z: Any) -> Any:
         """h = (r^2 - R^2) / (r + R), with R^2 cancelled before anything is rounded."""
@@ -48,7 +48,7 @@ class Globe:
         """Of a ray: whether it meets the atmosphere, where (two distances >= 0), and its lowest altitude from there
         on (m, >= 0).
         """
-        q, z = self._relative(ray.o)
+        q, z = self.relative(ray.o)
         h = self._altitude(q, z)
         d = ray.d
         cosine = d[0] * self.up[0] + d[1] * self.up[1] + d[2] * self.up[2]
@@ -72,7 +72,7 @@ class Globe:
     def cosines(self, p: Any, d: Any, sun: Any) -> tuple[Any, Any, Any, Any]:
         """Of a point: its altitude (m, not below the ground) and the cosines of the zenith angles of the directions
         ``d`` and ``sun`` there; and that of the angle between the two."""
-        q, z = self._relative(p)
+        q, z = self.relative(p)
         h = self._altitude(q, z)
         up = mi.Vector3f(*self.up)
         inverse = 1.0 / (self.radius + h)

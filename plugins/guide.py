@@ -119,7 +119,7 @@ class Guide:
         """The function of (distance, altitude, radius) that gives what scattered light is worth on a flight:
         [constituent]."""
         sun, row = self._sun, self.air.wavelengths.row(ray)
-        q, _ = self.air._relative(ray(f.start * self.air.scale))
+        q, _ = self.air.relative(ray(f.start * self.air.scale))
         nu = dr.dot(ray.d, sun)
         axial = dr.fma(self.air.radius, self._cosine, dr.dot(q, sun))  # r mu_s where the flight begins
         phases = way.phase_values(nu)
@@ -132,7 +132,7 @@ class Guide:
 
     def here(self, p: Any) -> tuple[Any, Any, Any]:
         """Altitude (m), vertical and sun cosine of a point."""
-        q, z = self.air._relative(p)
+        q, z = self.air.relative(p)
         up = dr.normalize(q + self.air.radius * mi.Vector3f(*self.air.up))
         return self.air._altitude(q, z), up, dr.dot(up, self._sun)
 

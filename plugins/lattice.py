@@ -86,7 +86,7 @@ class Lattice:
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*d.T.astype(np.float32)))
         si = scene.ray_intersect(ray)
-        q, z = self._globe._relative(si.p)
+        q, z = self._globe.relative(si.p)
         met = np.array(si.is_valid() & (self._globe.altitude(si.p) > -deepest))
         q, normal = np.array(q).T, np.array(si.n).T
         places = np.column_stack([q @ self._axes.T, np.array(self._globe.altitude(si.p))])[met]
@@ -114,7 +114,7 @@ class Lattice:
     def interval(self, ray: Any) -> tuple[Any, Any]:
         """First and last distance (scene units) of a ray between the planes about the nodes; none: last < first."""
         globe = self._globe
-        q, z = globe._relative(ray.o)
+        q, z = globe.relative(ray.o)
         axes = [mi.Vector3f(*(float(v) for v in axis)) for axis in (*self._axes, globe.up)]
         far = np.max(np.abs([self._low[:2], self._low[:2] + self._size[:2]]), axis=0)
         sag = float(far @ far) / (2.0 * globe.radius)
@@ -130,7 +130,7 @@ class Lattice:
     def node(self, p: Any, h: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
         """One of the eight nodes about a point of altitude ``h`` (m), the nearer one more often, so that its mean
         interpolates; and whether the point lies among nodes."""
-        q, _ = self._globe._relative(p)
+        q, _ = self._globe.relative(p)
         place = [dr.dot(q, mi.Vector3f(*(float(v) for v in axis))) for axis in self._axes] + [h]
         index, inside = mi.UInt32(0), mi.Bool(True)
         for i, count in enumerate(self.shape):

@@ -143,7 +143,9 @@ def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
 
 
 @pytest.mark.parametrize(
-    ("orders", "grey"), [(2, 0.0), pytest.param(None, 0.4, marks=pytest.mark.slow)], ids=["two", "all"]
+    ("orders", "grey"),
+    [(2, 0.0), pytest.param(3, 0.0, marks=pytest.mark.slow), pytest.param(None, 0.4, marks=pytest.mark.slow)],
+    ids=["two", "three", "all"],
 )
 def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders, grey):
     """Dust in which a low sun's beam is spent: nearly all light is of order 2 and more, and the towers hide where it
@@ -154,11 +156,11 @@ def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders,
     own, truth = (of_passes(tiles(passes(scene, 16, n), 8)) for scene, n in zip(scenes, samples, strict=True))
     free = shaded("atmosphere_path", orders, grey, air=DUST, sun=LOW_SUN, shaft_samples=0)
     without = tiles(passes(free, 1, 8), 8)[0]
-    for estimate in (own, truth):  # what two nodes a piece and a table of the field cost
-        estimate.variance[:] += (0.004 * truth.mean) ** 2
-    assert_agree(own, truth)
-    # Shapes take light away, and what is known of it is known well.
-    assert np.max(without / truth.mean) > 1.2
+    # Within 3 %, and a fifth of what shapes take: close to them it changes faster than from node to node.
+    allowed = 0.03 * truth.mean + 0.2 * np.maximum(without - truth.mean, 0.0)
+    assert np.all(np.abs(own.mean - truth.mean) < allowed + 3.0 * np.sqrt(own.variance + truth.variance))
+    # Shapes take light away, in some places most of it, and what is known of it is known well.
+    assert np.max(without / truth.mean) > 2.0
     assert np.median(np.sqrt(truth.variance) / truth.mean) < 0.02
 
 
