@@ -24,6 +24,7 @@ from .harmonics import pair_count, pairs, recurrence
 from .optics import Optics
 from .paths import lagrange
 from .refinement import Reference, Taps
+from .slopes import steep_nodes
 from .total import parity
 
 
@@ -139,6 +140,8 @@ class Field:
         k, fk = self.grid.locate_altitude(h)
         x = self.grid.sun_position(mu_s)
         s, fs = self.grid.locate_source(x)
+        if self._steep(h, mu_s):
+            fk, fs = dr.detach(fk), dr.detach(fs)  # see _moved
         nodes = [self.grid.node(level, sun) for level in (k, k + 1) for sun in (s, s + 1)]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
         return nodes, weights, [self.reference.at(level, x, active, self._guide) for level in (k, k + 1)]
@@ -211,8 +214,42 @@ class Field:
             steps = mu - basis.mu, sine * cos_phi - basis.x
             for step, slopes in zip(steps, sums[1:], strict=True):
                 total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
+        if self._steep(h, mu_s):
+            total = [a + b for a, b in zip(total, self._moved(h, mu_s, basis, active), strict=True)]
         solar = self.optics.spread(width).solar
         return [[e * v for e, v in zip(solar, total[n * channels :], strict=False)] for n in range(kinds)]
+
+    def _steep(self, h: Any, mu_s: Any) -> bool:
+        """Whether derivatives by a place or sun, of a fine solve, pass through look-ups there."""
+        return self.grid.resolution.twice and dr.grad_enabled(h, mu_s)
+
+    def _moved(self, h: Any, mu_s: Any, basis: _Harmonics, active: Any) -> list[Any]:
+        """0, with the derivatives of what ``unclipped`` sums by level and sun: [scatterer x channel]."""
+        t, channels, kinds = types(), self.optics.channel_count, len(self.optics.scatterers)
+        moved, parts = steep_nodes(self.grid, self.reference, self._guide, h, mu_s, active)
+        total = [0.0] * (kinds * channels)
+        with dr.suspend_grad():
+            moments, phases, recurrences, degrees = (dr.detach(v) for v in self._tables)
+            basis, stride = _Harmonics(basis.mu, basis.x, slopes=False), dr.opaque(t.UInt, pair_count(self.degree), 1)
+
+            def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
+                (value,), state = basis.next(packet(recurrences, i, 4, active), state)
+                degree = t.UInt(dr.gather(t.Float, degrees, i, active))
+                chi = row(phases, degree, kinds * channels, active=active, alone=True)
+                new = []
+                for (nodes, weights), old in zip(parts, sums, strict=True):
+                    corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
+                    slope = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
+                    new.append([dr.fma(value, chi[n] * slope[n % channels], s) for n, s in enumerate(old)])
+                return i + 1, state, new
+
+            sums = [[dr.zeros(t.Float, dr.width(h)) for _ in total] for _ in parts]
+            state = (t.UInt(0), basis.start(dr.width(h)), sums)
+            *_, slopes = dr.while_loop(state, lambda i, *_: i < stride, pair, label="slopes")
+            dr.eval(slopes)
+        for step, of_step in zip(moved, slopes, strict=True):
+            total = [dr.fma(step, slope, value) for slope, value in zip(of_step, total, strict=True)]
+        return total
 
 
 class _Harmonics:
@@ -273,20 +310,20 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
 
 
 def _between_levels(grid: Grid, values: Any, length: int) -> Any:
-    """[K, length] -> [levels, length]: cubic in the altitude coordinate."""
-    t = types()
+    """[K, length] -> [levels, length]: by the polynomial in the altitude coordinate through four nodes, or six where
+    derivatives are wanted."""
+    t, count = types(), min(6 if grid.resolution.twice else 4, grid.shape[0])
 
     def taps() -> tuple[Any, Any]:
         level = np.arange(grid.level_count) / grid.refine
-        first = np.clip(np.floor(level).astype(int) - 1, 0, max(grid.shape[0] - 4, 0))
-        nodes = (first[:, None] + np.arange(min(4, grid.shape[0]))).astype(float)
+        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, grid.shape[0] - count)
+        nodes = (first[:, None] + np.arange(count)).astype(float)
         return uints(first), floats(lagrange(nodes, level))
 
     first, weights = grid.kept("between levels", taps)
     lane = dr.arange(t.UInt, grid.level_count * length)
     level, place = lane // length, lane % length
-    start, count = dr.gather(t.UInt, first, level), min(4, grid.shape[0])
-    total = 0.0
+    start, total = dr.gather(t.UInt, first, level), 0.0
     for i in range(count):
         value = dr.gather(t.Float, values, (start + i) * length + place)
         total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)

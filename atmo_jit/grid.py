@@ -184,14 +184,19 @@ class Grid(Keeper):
 
     def prepare(self) -> None:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
-        dr.eval(self._u_buffer, self._sun_map, self._counts)
+        dr.eval(self._u_buffer, self._u_slopes, self._sun_map, self.counts)
 
     @cached_property
     def _u_buffer(self) -> Any:
         return floats(self._u)
 
     @cached_property
-    def _counts(self) -> tuple[Any, Any]:
+    def _u_slopes(self) -> Any:
+        """Slopes of u by altitude at the samples: those between two of them jump, near the ground by 2 per cent."""
+        return floats(np.gradient(self._u, self._h_of_u))
+
+    @cached_property
+    def counts(self) -> tuple[Any, Any]:
         """Of levels and of refined suns, which kernels read from memory: they serve grids of other sizes too."""
         return dr.opaque(types().UInt, self.level_count, 1), dr.opaque(types().UInt, self.sources, 1)
 
@@ -205,7 +210,13 @@ class Grid(Keeper):
         start = t.Float(cell)
         fraction = dr.fma(share, float(_FINE**2), -start * start) / dr.fma(2.0, start, 1.0)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return split(dr.lerp(u0, u1, fraction) * float(self.refine), self._counts[0])
+        if dr.grad_enabled(h):
+            slope = dr.gather(t.Float, self._u_slopes, cell), dr.gather(t.Float, self._u_slopes, cell + 1)
+            fraction = dr.detach(fraction)
+            u = dr.lerp(u0, u1, fraction) + (h - dr.detach(h)) * dr.lerp(*slope, fraction)
+        else:
+            u = dr.lerp(u0, u1, fraction)
+        return split(u * float(self.refine), self.counts[0])
 
     @cached_property
     def _sun_map(self) -> list[Any]:
@@ -224,11 +235,11 @@ class Grid(Keeper):
 
     def locate_source(self, x: Any) -> tuple[Any, Any]:
         """The same by the sun coordinate ``x``."""
-        return split(x * float(self.sun_refine), self._counts[1])
+        return split(x * float(self.sun_refine), self.counts[1])
 
     def node(self, level: Any, source: Any) -> Any:
         """Index of a level's node under a refined sun."""
-        return level * self._counts[1] + source
+        return level * self.counts[1] + source
 
 
 def arrays_in(*things: Any) -> list[Any]:

@@ -133,7 +133,7 @@ def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], re
         angles = [doubles(np.radians(where[n])) for n in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
         place = doubles(where["altitude_m"]), *angles
         rays, _, _ = sky.enter(*place)
-        pieces = [Pieces.of(band.optics, rays) for band in sky.solutions]
+        pieces = [Pieces.of(band.optics, rays, fine=True) for band in sky.solutions]
         found = sky.rays(*place, pieces=pieces).radiance
         dr.eval(found)
         return np.stack([v.numpy() for v in found], axis=-1).astype(float)
