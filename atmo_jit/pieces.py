@@ -36,6 +36,7 @@ LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves 
 TWICE = (0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5)  # of a piece: Gauss points, where fine solves ask for the field
 # Of a ray's first piece: beside the observer the derivative by its altitude asks for more than two places.
 FIRST_PART = 0.15
+WHOLE = 0.999  # of a piece is all of it
 # Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
 # line, leaves single precision.
 NOTHING = 1e-18
@@ -74,9 +75,10 @@ class Pieces:
             def cut(store: Any) -> Any:
                 def piece(d: Any, shell: Any, amounts: list[Any], number: Any) -> tuple[Any, ...]:
                     end, after = cuts.after(d, shell, amounts)
-                    first = (number == 0) & part
-                    end = dr.select(first, dr.lerp(d, end, FIRST_PART), end)
-                    shell = dr.select(first, shell, after)
+                    # Its second part ends where all of it would.
+                    whole = dr.select(number == 0, FIRST_PART * end, d * (1.0 / FIRST_PART))
+                    parted = part & ((number == 0) | ((number == 1) & (whole < WHOLE * end)))
+                    end, shell = dr.select(parted, whole, end), dr.select(parted, shell, after)
                     if store is not None:
                         store(number, d, end)
                     density = [
