@@ -210,12 +210,10 @@ class Grid(Keeper):
         start = t.Float(cell)
         fraction = dr.fma(share, float(_FINE**2), -start * start) / dr.fma(2.0, start, 1.0)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
+        u = dr.lerp(u0, u1, dr.detach(fraction))
         if dr.grad_enabled(h):
-            slope = dr.gather(t.Float, self._u_slopes, cell), dr.gather(t.Float, self._u_slopes, cell + 1)
-            fraction = dr.detach(fraction)
-            u = dr.lerp(u0, u1, fraction) + (h - dr.detach(h)) * dr.lerp(*slope, fraction)
-        else:
-            u = dr.lerp(u0, u1, fraction)
+            slopes = (dr.gather(t.Float, self._u_slopes, cell + i) for i in (0, 1))
+            u = dr.fma(h - dr.detach(h), dr.lerp(*slopes, dr.detach(fraction)), u)
         return split(u * float(self.refine), self.counts[0])
 
     @cached_property

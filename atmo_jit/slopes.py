@@ -11,16 +11,16 @@ from typing import Any
 
 import drjit as dr
 
-from .backend import types
-from .grid import Grid
-from .refinement import Reference
+from .backend import packet, types
+from .grid import Grid, split
+from .refinement import FINE, Reference
 
 
 def steep_nodes(
     grid: Grid, reference: Reference, guide: Any, h: Any, mu_s: Any, active: Any
 ) -> tuple[tuple[Any, Any], list[tuple[list[Any], list[list[Any]]]]]:
     """How far the coordinates of level and refined sun at altitude ``h`` and sun cosine ``mu_s`` have moved, 0 with
-    their derivatives; and for either the nodes [8] and weights [8][channel] whose sum is the slope by it. ``guide``:
+    their derivatives; and for either nodes and their weights [channel] whose sum is the slope by it. ``guide``:
     the reference at the levels."""
     k, at_k = grid.locate_altitude(h)
     x = grid.sun_position(mu_s)
@@ -28,8 +28,8 @@ def steep_nodes(
     moved = at_k - dr.detach(at_k), at_s - dr.detach(at_s)
     with dr.suspend_grad():
         x, at_k, at_s = (dr.detach(v) for v in (x, at_k, at_s))
-        levels, by_level = _cubic_slopes(k, at_k, grid.counts[0])
-        suns, by_sun = _cubic_slopes(s, at_s, grid.counts[1])
+        levels, by_level = cubic_slopes(k, at_k, grid.counts[0])
+        suns, by_sun = cubic_slopes(s, at_s, grid.counts[1])
         parts = []
         for here, share, there, portion in (
             (levels, by_level, [s, s + 1], [1.0 - at_s, at_s]),
@@ -41,10 +41,27 @@ def steep_nodes(
                 [a * b * part for part in scale] for a, scale in zip(share, scales, strict=True) for b in portion
             ]
             parts.append((nodes, weights))
+        # The reference is no line between its own suns, and moves too.
+        turns = [_reference_slope(reference, guide, level, x, active) for level in (k, k + 1)]
+        nodes += [grid.node(level, sun) for level in (k, k + 1) for sun in (s, s + 1)]
+        weights += [
+            [a * b * (part / grid.sun_refine) for part in turn]
+            for a, turn in zip([1.0 - at_k, at_k], turns, strict=True)
+            for b in (1.0 - at_s, at_s)
+        ]
     return moved, parts
 
 
-def _cubic_slopes(index: Any, fraction: Any, count: Any) -> tuple[list[Any], list[Any]]:
+def _reference_slope(reference: Reference, guide: Any, level: Any, x: Any, active: Any) -> list[Any]:
+    """Slope of the reference by the sun coordinate ``x``, per channel."""
+    count = dr.opaque(types().UInt, FINE * (reference.grid.shape[1] - 1) + 1, 1)
+    s, f = split(x * float(FINE), count)
+    suns, by_sun = cubic_slopes(s, f, count)
+    held = [packet(guide, level * count + sun, 4, active)[: reference.channels] for sun in suns]
+    return [float(FINE) * sum(w * v for w, v in zip(by_sun, part, strict=True)) for part in zip(*held, strict=True)]
+
+
+def cubic_slopes(index: Any, fraction: Any, count: Any) -> tuple[list[Any], list[Any]]:
     """Four of ``count`` nodes about a fraction of the interval after node ``index``, and the slopes there of their
     Lagrange polynomials."""
     t = types()
