@@ -53,7 +53,9 @@ class SunColumns:
         knee = 0.7 * np.sqrt(2.0 * thinnest(atmosphere) / atmosphere.bottom_radius_m)
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
-        self._rows = max(4, round(size[0] / self._shells))  # intervals per shell
+        # Intervals per shell. It and their number are parameters: where a level more is cut no kernel is compiled.
+        self._intervals = max(4, round(size[0] / self._shells))
+        self._rows, self._last = parameter(self._intervals), parameter(self._shells - 1.0)
         edges = np.sqrt(breaks / atmosphere.thickness_m) * _CELLS
         cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
         # Low, high, 1 / width and number of every shell, and of the shell at the start of every cell.
@@ -75,8 +77,8 @@ class SunColumns:
     def _build(self, known: Any = None) -> Any:
         """The table. ``known``: its numbers; then only derivatives are made."""
         t = types()
-        rows, cosines = self._rows + 1, self._cosines
-        lane = dr.arange(t.UInt, self._shells * rows * cosines)
+        rows, cosines = t.UInt(self._rows) + 1, self._cosines
+        lane = dr.arange(t.UInt, self._shells * (self._intervals + 1) * cosines)
         place, column = lane // cosines % rows, lane % cosines
         low, high, _, _ = packet(self._bounds, lane // (cosines * rows), 4)
         x = t.Float(place) / self._rows
@@ -141,14 +143,14 @@ class SunColumns:
         cosines = self._cosines
         position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
         _, high, _, shell = packet(self._cells, dr.minimum(t.UInt(position), _CELLS), 4, active)
-        shell = t.UInt(dr.minimum(dr.select(h >= high, shell + 1.0, shell), self._shells - 1.0))
+        shell = t.UInt(dr.minimum(dr.select(h >= high, shell + 1.0, shell), self._last))
         _, high, per_width, _ = packet(self._bounds, shell, 4, active)
         depth = dr.clip((high - h) * per_width, 0.0, 1.0)
         y = dr.safe_sqrt(depth) * self._rows
-        below = dr.minimum(t.UInt(y), self._rows - 1)
+        below = dr.minimum(t.UInt(y), t.UInt(self._rows) - 1)
         start = t.Float(below)
-        by_altitude = dr.fma(depth, float(self._rows**2), -start * start) / dr.fma(2.0, start, 1.0)
-        corner = dr.fma(shell, self._rows + 1, below) * cosines
+        by_altitude = dr.fma(depth, self._rows * self._rows, -start * start) / dr.fma(2.0, start, 1.0)
+        corner = dr.fma(shell, t.UInt(self._rows) + 1, below) * cosines
         if isinstance(mu, float):
             corner += 0 if mu == 0.0 else cosines - 1
             fx = None
@@ -168,7 +170,7 @@ class SunColumns:
         if not all(self._logarithmic):
             # x under the break is sqrt(bend + x^2) - sqrt(bend) away from it, in units of a horizontal ray's first row.
             r = self.optics.radius + high
-            bend = mu * mu * r * (0.5 * self._rows**2) * per_width
+            bend = mu * mu * r * (0.5 * self._rows * self._rows) * per_width
             here, nearer, farther = (dr.sqrt(dr.fma(x, x, bend)) for x in (y, start, start + 1.0))
             above, beneath = dr.maximum(here + nearer, 1e-30), here + farther
             by_distance = by_altitude * ((farther + nearer) / above)

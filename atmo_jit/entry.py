@@ -20,16 +20,19 @@ def enter(
     distance_m: Any = None,
     *,
     exact: bool,
+    recorded: bool,
 ) -> tuple[Rays, Any, Any]:
     """Rays moved, in double precision, to where they enter the atmosphere of ``optics``, and left in it if ``exact``;
     whether they meet air at all; whether they leave for space.
 
-    Altitude and distance in m, angles in radians; see Sky.rays.
+    Altitude and distance in m, angles in radians; see Sky.rays. The planet's radius is in double precision too, unless
+    the rays are ``recorded`` (evaluation.py) with what kernels take from ``optics``: seen from far out, half a step of
+    a radius in single precision, some tenths of a metre, is as much of the altitude at which a ray passes.
     """
     t = types()
     wide = t.Float64
     altitude, theta_s, theta, phi = (wide(v) for v in (altitude_m, sun_zenith, view_zenith, azimuth))
-    radius, top = wide(optics.radius), wide(optics.thickness)
+    radius, top = (wide(optics.radius), wide(optics.thickness)) if recorded else optics.planet
     mu, mu_s = dr.cos(theta), dr.cos(theta_s)
     nu = mu * mu_s + dr.sin(theta) * dr.sin(theta_s) * dr.cos(phi)
     r = radius + altitude
@@ -47,7 +50,8 @@ def enter(
         dr.select(outside, (r * mu_s + gap * nu) / r_in, mu_s),
         nu,
     )
-    rays = rays_to_boundary(optics, dr.minimum(altitude, top), *(dr.clip(v, -1.0, 1.0) for v in cosines))
+    cosines = [dr.clip(v, -1.0, 1.0) for v in cosines]
+    rays = rays_to_boundary(optics, dr.minimum(altitude, top), *cosines, planet=(radius, top))
     rays = rays if exact else rays.single()
     meets_air = t.Bool(meets)
     rays.stop = dr.select(meets_air, rays.stop, 0.0)

@@ -79,6 +79,12 @@ def corners(atmosphere: Atmosphere) -> list[float]:
     return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
 
 
+def has_steps(atmosphere: Atmosphere) -> bool:
+    """Whether a density jumps anywhere in the air."""
+    tables = (c.profile for c in atmosphere.constituents if isinstance(c.profile, Tabulated))
+    return any(step < atmosphere.thickness_m for profile in tables for step in profile.steps_m)
+
+
 def _scale_height_levels(height: float, extinction: float, radius: float, top: float) -> list[float]:
     """Altitudes (m) at which an exponential profile is cut."""
     levels = [height * f for f in LEVELS]

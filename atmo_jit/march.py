@@ -4,7 +4,7 @@ one pass.
 A ray is cut where something happens: at the altitudes where a profile has a kink or has changed by some e-folds, at
 its perigee, where it enters or leaves the planet's shadow, and wherever the optical depth has grown by MAX_DEPTH in a
 channel in which anything is still seen. Inside a piece everything is smooth and four Gauss-Legendre nodes suffice, in
-clear air and in fog alike.
+clear air and in fog alike; eight where densities jump.
 Every ray stops as soon as its transmittance is spent.
 """
 
@@ -19,11 +19,14 @@ import numpy as np
 from .backend import floats, packet, parameter, row, table_of, types
 from .column import SunColumns
 from .geometry import UPRIGHT, altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
-from .levels import corners
+from .levels import corners, has_steps
 from .optics import Optics
 from .quadrature import gauss_legendre, running_integral
 
 NODES = 4  # per piece
+# The same where densities jump: the column toward the sun has a square-root edge where sunlight grazes a jump, and
+# pieces begin there.
+NODES_AT_STEPS = 8
 FEW = 4  # per piece, for densities and columns, which are smooth
 MAX_DEPTH = 1.0  # optical depth of a piece: exp(-tau) over it is a polynomial of degree 7 to 1e-7
 MAX_TURN = 0.03  # radians about the planet's centre: the light that scatters again changes with the sun's height
@@ -69,16 +72,19 @@ class Source(Protocol):
         """Integral of phase function times radiance over all directions, toward (mu, phi): [scatterer][channel]."""
 
 
-def rays_to_boundary(optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any) -> Rays:
-    """Rays from ``h`` to whatever they meet first, the ground or the top, in the precision of ``h``.
+def rays_to_boundary(
+    optics: Optics, h: Any, mu: Any, mu_s: Any, nu: Any, planet: tuple[Any, Any] | None = None
+) -> Rays:
+    """Rays from ``h`` to whatever they meet first, the ground or the top, in the precision of ``h``; ``planet``: its
+    radius and thickness of air in that precision.
 
     That is decided in it too: in single precision a ray 1e-7 rad off the horizon may be taken for one
     on its other side, which sees other light.
     """
     t, wide = types(), type(h)
-    radius = wide(optics.radius)
+    radius, top = planet or (wide(optics.radius), wide(optics.thickness))
     ground = hits_ground(radius, h, mu)
-    stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, wide(optics.thickness)))
+    stop = dr.select(ground, distance_down(radius, h, mu, 0.0), distance_up(radius, h, mu, top))
     return Rays(h, mu, mu_s, nu, stop, t.Bool(ground))
 
 
@@ -247,7 +253,7 @@ def march(
     columns: SunColumns,
     rays: Rays,
     *,
-    nodes: int = NODES,
+    nodes: int | None = None,
     single: bool = True,
     source: Source | None = None,
     shells: Shells | None = None,
@@ -256,7 +262,8 @@ def march(
 
     Single scattering is exact up to the quadrature: Bruneton & Neyret 2008, eq. 9 for order 1, with the planet's
     shadow. ``source``: the field of all orders that scatter once more on this ray; it is asked once per piece, at the
-    centroid of the piece's weight, which is exact for a field that is linear there. ``shells``: those of these
+    centroid of the piece's weight, which is exact for a field that is linear there. ``nodes``: per piece, where not as
+    many as the atmosphere's profiles need. ``shells``: those of these
     optics, where they cannot be made because a kernel is being traced. Where rays are and where they are cut is
     computed in the precision of the rays and of the optics (Optics.exact).
     """
@@ -268,7 +275,7 @@ def march(
         return Light(zero, list(zero), [dr.full(t.Float, 1.0, width) for _ in range(c_count)])
     shells = shells or Shells(optics)
     cuts, r_mu = Cuts(optics, rays, sunlit=single, shells=shells), (optics.radius + rays.h) * rays.mu
-    rule = shells.rule(nodes)
+    rule = shells.rule(nodes or (NODES_AT_STEPS if has_steps(optics.atmosphere) else NODES))
     phases = {k: optics.phase_values(k, t.Float(rays.nu)) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
@@ -365,7 +372,13 @@ def _first_shell(optics: Optics, rays: Rays, breaks: Any, last: Any) -> Any:
         level = dr.gather(type(breaks), breaks, i)
         return (level < rays.h) | (~falling & (level <= rays.h))
 
-    index = dr.binary_search(0, count - 1, below)
+    # dr.binary_search, which compiles the number of breaks.
+    index, end = t.UInt(0), t.UInt(last) + 1
+    for _ in range(count.bit_length()):
+        middle = (index + end) >> 1
+        under = below(middle)
+        index = dr.select(under, dr.minimum(middle + 1, end), index)
+        end = dr.select(under, end, middle)
     return dr.clip(t.Float(index) - 1.0, 0.0, last)
 
 

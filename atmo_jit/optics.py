@@ -134,15 +134,21 @@ class Optics:
         return other
 
     @cached_property
+    def planet(self) -> tuple[Any, Any]:
+        """Radius and thickness (m) in double precision, whatever that of these optics."""
+        t, air = types().Float64, self.atmosphere
+        return dr.opaque(t, air.bottom_radius_m, 1), dr.opaque(t, air.thickness_m, 1)
+
+    @cached_property
     def exact(self) -> Optics | None:
         """These optics with altitudes in double precision, for rays that are too (a tenth slower); None where the
         rounding of altitudes in single precision is not seen."""
         if max((self._rounded(c) for c in self.constituents), default=0.0) < UNSEEN:
             return None
-        t, air = types().Float64, self.atmosphere
+        t = types().Float64
         other = self.with_values({})
         other._is_exact = True
-        other.radius, other.thickness = (dr.opaque(t, v, 1) for v in (air.bottom_radius_m, air.thickness_m))
+        other.radius, other.thickness = self.planet
         other.profiles = [
             [doubles(v) if isinstance(v, np.ndarray) else dr.opaque(t, v, 1) for v in _numbers_of(c.profile)]
             for c in self.constituents

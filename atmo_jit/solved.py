@@ -235,8 +235,10 @@ class Sky:
             order = side_by_side(air.bottom_radius_m, air.thickness_m, altitude_m, view_zenith)
             light = self.rays(*(doubles(v[order]) for v in given), ground=ground, sun_disc=sun_disc)
             return light.taken(np.argsort(order))
-        exact = pieces is None and shells is None and self._bands[0].optics.exact is not None
-        rays, meets_air, passes = self.enter(altitude_m, sun_zenith, view_zenith, azimuth, distance_m, exact=exact)
+        recorded = pieces is not None or shells is not None
+        exact = not recorded and self._bands[0].optics.exact is not None
+        views = (altitude_m, sun_zenith, view_zenith, azimuth, distance_m)
+        rays, meets_air, passes = self.enter(*views, exact=exact, recorded=recorded)
         radiance, transmittance = [], []
         disc = self._disc(rays, passes) if sun_disc else None
         for i, band in enumerate(self._bands):
@@ -315,10 +317,10 @@ class Sky:
             sky += [dr.select(h < band.optics.thickness, value, 0.0) for value in scattered]
         return sun, sky
 
-    def enter(self, *views: Any, exact: bool = False) -> tuple[Rays, Any, Any]:
+    def enter(self, *views: Any, exact: bool = False, recorded: bool = True) -> tuple[Rays, Any, Any]:
         """Rays where they enter the atmosphere (entry.enter)."""
         optics = self._bands[0].optics
-        return enter(optics.exact if exact else optics, *views, exact=exact)
+        return enter(optics.exact if exact else optics, *views, exact=exact, recorded=recorded)
 
     def _disc(self, rays: Rays, passes: Any) -> Any:
         """Radiance of the unattenuated solar disc per unit irradiance (1/sr), on the rays that meet it; uniform."""

@@ -241,8 +241,18 @@ def test_mono_shows_the_wavelength_nearest_to_555_nm(plugins):
     assert air.air.wavelengths.channels == [1]
 
 
-@pytest.mark.parametrize("integrator", ["volpath", "volpathmis", "prbvolpath"])
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+# Each pair compiles kernels of its own for seconds.
+@pytest.mark.parametrize(
+    ("variant", "integrator"),
+    [
+        ("llvm_ad_rgb", "volpath"),
+        ("llvm_ad_rgb", "prbvolpath"),
+        ("llvm_ad_spectral", "volpathmis"),
+        pytest.param("llvm_ad_spectral", "volpath", marks=pytest.mark.slow),
+        pytest.param("llvm_ad_spectral", "prbvolpath", marks=pytest.mark.slow),
+        pytest.param("llvm_ad_rgb", "volpathmis", marks=pytest.mark.slow),
+    ],
+)
 def test_scene_of_ones_own_with_a_null_sphere(plugins, variant, integrator):
     """The medium as any other, inside a sphere with a null BSDF, seen from space, against the scene of ``planet``."""
     mi.set_variant(variant)

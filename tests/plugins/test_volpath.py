@@ -78,7 +78,7 @@ def test_things_in_the_air(rgb):
     assert_agree(own, stock)
 
 
-@pytest.mark.parametrize("most", [1, 2, 3])
+@pytest.mark.parametrize("most", [1, pytest.param(2, marks=pytest.mark.slow), 3])
 def test_depth_counts_as_in_volpath(rgb, most):
     stock = {"rr_depth": 64, "max_depth": most}
     own = of_passes(blocks(pictures.render(things("atmosphere_volpath", max_depth=most), 24, seed=0)))
