@@ -21,10 +21,12 @@ THICK_DEGREE, DEEP_DEGREE = 16, 24  # of order 1
 MANY = 20  # events; light that has as many is lost by what each order lacks
 # Few, so that compiled kernels are shared between atmospheres; to degree 24 haze of g = 0.9 has ripple at the horizon.
 FIRST_DEGREES = (2, 4, 6, 8, 12, 16, 20, 24, 32)
+AIR_MASS = 20.0  # of rays two degrees above the horizon, where light of high degree is needed first
+NEAR_GROUND = 1.0  # see Resolution.near_ground
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 # More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
 FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 12
-FINE_NEAR_GROUND, FINE_ORDERS = 1.0, 2  # see Resolution.near_ground; azimuthal orders more
+FINE_ORDERS = 2  # azimuthal orders more
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -53,8 +55,9 @@ class Resolution:
     phase functions apart.
     ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
     steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
-    ``near_ground``: so many times as many altitudes as follow a constituent are spread evenly over the logarithm of the
-    altitude; ``twice``: derivatives ask for the field at two places of every piece of a ray.
+    ``near_ground``: so many times as many altitudes as follow a constituent are spread evenly over the logarithm of
+    the altitude, but for clouds, whose light passes the top; ``twice``: derivatives ask for the field at two places
+    of every piece of a ray.
     ``deep``: altitudes are denser at the top than at the bottom: all the light of a white cloud passes there twice.
     """
 
@@ -90,15 +93,15 @@ class Resolution:
         """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
 
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
-        particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l is l g^(l - 1),
-        which fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
-        orders have all degrees, and two azimuthal orders more. Altitudes are dense near the ground, order 1 has four
-        times as many suns, look-ups twice as many levels and suns, and rays ask for the field twice a piece.
+        particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l is l g^(l -
+        1), which fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's;
+        so all orders have all degrees, and two azimuthal orders more. Order 1 has four times as many suns, look-ups
+        twice as many levels and suns, and rays ask for the field twice a piece.
         """
-        first = _degree(atmosphere, 1, 2, 0.25 * tolerance)
-        later = min(_degree(atmosphere, 2, 3, 0.01 * tolerance), first)
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
+        first = _degree(atmosphere, 1, 2, 0.5 * tolerance)
+        later = min(_degree(atmosphere, 2, 3, (0.01 if thick else 0.1) * tolerance), first)
         deep = float(np.max(np.multiply(*_scattering(atmosphere)))) > DEEP
         if thick:
             first, later = min(first, DEEP_DEGREE if deep else THICK_DEGREE), min(later, 8)
@@ -116,7 +119,7 @@ class Resolution:
         return cls(
             altitudes=_altitudes(atmosphere, altitudes, thick, deep),
             deep=deep,
-            near_ground=FINE_NEAR_GROUND if fine else 0.0,
+            near_ground=NEAR_GROUND if fine or not thick else 0.0,
             twice=fine,
             refine=4 if fine else 2,
             sun_refine=8 if fine else 4,
@@ -147,10 +150,10 @@ def _columns(atmosphere: Atmosphere, fine: bool) -> tuple[int, int]:
 
 
 def _stage(degree: int) -> Stage:
-    """Directions for moments up to ``degree``: light varies less with azimuth than with the angle from the zenith,
-    which has the horizon in it."""
-    degree = max(degree, 2)
-    most = max(2, degree // 4 * 2)
+    """Directions for moments up to ``degree``, made even: light varies less with azimuth than with the angle from
+    the zenith, which has the horizon in it."""
+    degree = max(2, degree + degree % 2)
+    most = max(2, (degree + 2) // 4 * 2)
     return Stage(degree, most, max(5, degree + 2), max(3, degree), most + 1 + (most == 2))
 
 
@@ -163,7 +166,7 @@ def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> i
             continue
         # How much of the light they meet these particles scatter.
         depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
-        share = -np.expm1(-3.0 * depth) * constituent.single_scattering_albedo
+        share = -np.expm1(-AIR_MASS * depth) * constituent.single_scattering_albedo
         shares: dict[Any, float] = {}
         for wavelength, part in enumerate(share.tolist()):
             phase = constituent.phase.at(wavelength)

@@ -14,6 +14,7 @@ from atmo_jit.resolution import CLOUD, Resolution, column_of
 TOLERANCE = 0.01
 FIRST_DEPTH = 0.03  # at most, of the air below the second altitude: that of the clear air of a planet like the earth
 MOST_ALTITUDES = 64
+NEAR_GROUND = 2.0  # see Resolution.near_ground; twice that of other solves
 
 
 def near_ground(atmosphere: Atmosphere) -> Resolution:
@@ -25,6 +26,7 @@ def near_ground(atmosphere: Atmosphere) -> Resolution:
     resolution = Resolution.suited(atmosphere, TOLERANCE)
     if sum(float(np.max(c.extinction_per_m)) * column_of(atmosphere, c) for c in atmosphere.constituents) > CLOUD:
         return resolution
+    resolution = replace(resolution, near_ground=NEAR_GROUND)
     h = np.linspace(0.0, float(Grid.of(atmosphere, resolution).h[1]), 65)
     extinction = sum(c.extinction_per_m[:, None] * np.asarray(c.profile.density(h)) for c in atmosphere.constituents)
     depth = float(np.max(np.trapezoid(extinction, h), initial=0.0)) if atmosphere.constituents else 0.0

@@ -6,6 +6,7 @@ import pytest
 
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.solved import Sky
+from bench.differences import shorter_pieces
 from bench.worlds import WORLDS
 
 
@@ -16,7 +17,9 @@ def earth_sky() -> Sky:
 
 @pytest.fixture(scope="package")
 def hazy_sky() -> Sky:
-    return Sky(Atmosphere.load("earth").replace({"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.9}))
+    """Its rays are cut at twice as many levels: long pieces through haze are up to 0.2 per cent off."""
+    with shorter_pieces():
+        return Sky(Atmosphere.load("earth").replace({"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.9}))
 
 
 @pytest.fixture(scope="package")
