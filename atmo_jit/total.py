@@ -134,35 +134,80 @@ def _rest(
     where r_l is how order and order 1 compare at degree l, m >= 1: m = 0 has the horizon in it.
     """
     t, channels, entries, (altitudes, suns) = types(), first.channels, pair_count(first.degree), grid.shape
+    alike: dict[tuple[int, int], list[tuple[int, Moments, tuple[Any, Any]]]] = {}
+    for events, (order, counts) in enumerate(zip(rest, shares, strict=True), 1):
+        alike.setdefault((order.degree, order.most), []).append((events, order, counts))
+    parts = [
+        (group[0][1], _weighed(grid, group), _peaks(optics, grid, reference, first, group)) for group in alike.values()
+    ]
     lane = dr.arange(t.UInt, altitudes * suns * (entries + 2) * channels)
     channel, place = lane % channels, lane // channels
     entry, node = place % (entries + 2), place // (entries + 2)
     sun, k = node % suns, node // suns
-    arrives, entry = entry > entries, dr.minimum(entry, entries)
-    sharp = None
-    fading: dict[int, Any] = {}
-    total = 0.0
-    for events, (order, (counted, arriving)) in enumerate(zip(rest, shares, strict=True), 1):
-        there = dr.gather(t.UInt, _places(grid, first, order), entry)
+    moment = entry < entries
+    sharp, total = None, 0.0
+    for order, weighed, peaks in parts:
+        # Place + 1 among the moments of the orders; after them come the irradiances.
+        there = dr.gather(t.UInt, _places(grid, first, order), dr.minimum(entry, entries))
+        there = dr.select(moment, there, entry - entries + order.entries)
         held = there > 0
-        index = order.index(k, dr.maximum(there, 1) - 1, sun, channel)
-        weight = dr.select(
-            arrives, *(dr.gather(t.Float, share, sun * channels + channel) for share in (arriving, counted))
-        )
-        value = dr.gather(t.Float, order.values, index, held)
-        if order.entries < first.entries:
-            l_ = dr.gather(t.UInt, _degrees(grid, first.degree), entry)
-            if sharp is None:
-                sharp = dr.gather(t.Float, first.values, first.index(k, entry, sun * grid.first, channel))
-            if order.degree not in fading:
-                fading[order.degree] = _fading(optics, l_, order.degree, first.degree, channel)
-            size = ((dr.minimum(l_, order.degree) * altitudes + k) * suns + sun) * channels + channel
-            peak = sharp * dr.gather(t.Float, _peak(grid, reference, first, order), size)
-            for _ in range(events):
-                peak = peak * fading[order.degree]
-            value = dr.select(held, value, peak)
-        total = dr.fma(value, weight, total)
+        index = (node * (order.entries + 1) + dr.maximum(there, 1) - 1) * channels + channel
+        total = total + dr.gather(t.Float, weighed, index, held, mode=dr.ReduceMode.NoConflicts)
+        if peaks is None:
+            continue
+        if sharp is None:
+            index = first.index(k, dr.minimum(entry, entries), sun * grid.first, channel)
+            sharp = dr.gather(t.Float, first.values, index, moment, mode=dr.ReduceMode.NoConflicts)
+            l_ = dr.gather(t.UInt, _degrees(grid, first.degree), dr.minimum(entry, entries))
+            size = (l_ * (altitudes * suns) + node) * channels + channel
+        ratio = dr.gather(t.Float, peaks, size, ~held, mode=dr.ReduceMode.Expand)
+        total = dr.fma(sharp, ratio, total)
     total = total * dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
+    return evaluated(total)
+
+
+def _weighed(grid: Grid, orders: list[tuple[int, Moments, tuple[Any, Any]]]) -> Any:
+    """Sum over orders of one degree of what they have, times what that counts: moments, and the irradiance as it
+    reflects and as it arrives, [K, S, entries + 1, channels]."""
+    light, (altitudes, suns) = orders[0][1], grid.shape
+    t, channels, rows = types(), light.channels, light.entries + 1
+    lane = dr.arange(t.UInt, altitudes * suns * rows * channels)
+    channel, place = lane % channels, lane // channels
+    entry, node = place % rows, place // rows
+    sun, k = node % suns, node // suns
+    arrives, total = entry == rows - 1, 0.0
+    for _, order, both in orders:
+        value = dr.gather(t.Float, order.values, order.index(k, dr.minimum(entry, rows - 2), sun, channel))
+        counted, arriving = (dr.gather(t.Float, share, sun * channels + channel) for share in both)
+        total = dr.fma(value, dr.select(arrives, arriving, counted), total)
+    return evaluated(total)
+
+
+def _peaks(
+    optics: Optics,
+    grid: Grid,
+    reference: Reference,
+    first: Moments,
+    orders: list[tuple[int, Moments, tuple[Any, Any]]],
+) -> Any:
+    """What order 1's moments of degree l count in the sum of orders of one degree where these have none, [l, K, S,
+    channels]; None: they have all."""
+    light, (altitudes, suns) = orders[0][1], grid.shape
+    if light.entries == first.entries:
+        return None
+    t, channels = types(), first.channels
+    lane = dr.arange(t.UInt, (first.degree + 1) * altitudes * suns * channels)
+    channel, node = lane % channels, lane // channels
+    l_ = node // (altitudes * suns)
+    fading = _fading(optics, l_, light.degree, first.degree, channel)
+    known = lane - (l_ - dr.minimum(l_, light.degree)) * (altitudes * suns * channels)
+    total, faded, done = 0.0, 1.0, 0
+    for events, order, (counted, _) in orders:
+        for _ in range(events - done):
+            faded = faded * fading
+        done = events
+        ratio = dr.gather(t.Float, _peak(grid, reference, first, order), known)
+        total = dr.fma(faded * dr.gather(t.Float, counted, node % suns * channels + channel), ratio, total)
     return evaluated(total)
 
 
