@@ -47,6 +47,8 @@ DEFAULTS: dict[str, Any] = {
 REQUIRED = ("wavelengths_nm", "bottom_radius_m", "top_radius_m")
 # Of the largest air that is solved in any time: at 1e11 light is a third off, and 1e15 takes no end.
 RADIUS = Range(0, 1e10, low_open=True)
+# Radii of the planet: a ray from the ground of a smaller one takes no end, nor does one where single precision is 0.
+FARTHEST_TOP, SMALLEST = 10000.0, 1e-3
 # Every species makes the kernels larger: with this many the first solve takes half a minute, with thousands no end.
 MOST_SPECIES = 64
 SCATTERED_FRACTION = Range(0, 1, low_open=True)
@@ -117,6 +119,11 @@ class Atmosphere:
             raise AtmosphereError(
                 "top_radius_m", shown(d["top_radius_m"]), f"a number above bottom_radius_m ({bottom:g})"
             )
+        if top > FARTHEST_TOP * bottom:
+            allowed = f"a number up to {FARTHEST_TOP:g} times bottom_radius_m ({bottom:g})"
+            raise AtmosphereError("top_radius_m", shown(d["top_radius_m"]), allowed)
+        if bottom < SMALLEST:
+            raise AtmosphereError("bottom_radius_m", shown(d["bottom_radius_m"]), f"a finite number >= {SMALLEST:g}")
         sun = number(d["sun_angular_radius_deg"], "sun_angular_radius_deg", Range(0, 90, high_open=True))
         self._set(
             _document=document,

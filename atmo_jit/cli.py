@@ -63,6 +63,8 @@ def group(settings: _Settings, debug: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line (``sys.argv`` if no ``arguments`` are given) and return its exit status."""
+    # Closed by the shell (>&-): what is written there is for nobody.
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
     settings = _Settings(debug=os.environ.get("ATMO_JIT_DEBUG", "0") not in ("", "0"))
     with interrupted_by_signals() as interrupt:
         try:

@@ -294,7 +294,7 @@ class Linearization:
         """What Evaluation takes beside values: views, pieces of their rays, what is taken over from the solve."""
         views = {name: doubles(values) for name, values in self.views.items()}
         rays, _, _ = self.sky.enter(*where(views))
-        pieces = [Pieces.of(optics, rays) for optics in self._optics]
+        pieces = [Pieces.of(optics, rays, fine=self.sky.resolution.twice) for optics in self._optics]
         return views, pieces, self._solved
 
     @cached_property

@@ -20,10 +20,11 @@ from .backend import evaluated, floats, packet, padded, row, stored, sum_loop, t
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
-from .harmonics import pair_count, pairs, recurrence
+from .harmonics import Harmonics, pair_count, pairs, recurrence
 from .optics import Optics
 from .paths import lagrange
 from .refinement import Reference, Taps
+from .slopes import steep_nodes
 from .total import parity
 
 
@@ -139,6 +140,8 @@ class Field:
         k, fk = self.grid.locate_altitude(h)
         x = self.grid.sun_position(mu_s)
         s, fs = self.grid.locate_source(x)
+        if self._steep(h, mu_s):
+            fk, fs, x = dr.detach(fk), dr.detach(fs), dr.detach(x)  # see _moved
         nodes = [self.grid.node(level, sun) for level in (k, k + 1) for sun in (s, s + 1)]
         weights = [(1.0 - fk) * (1.0 - fs), (1.0 - fk) * fs, fk * (1.0 - fs), fk * fs]
         return nodes, weights, [self.reference.at(level, x, active, self._guide) for level in (k, k + 1)]
@@ -181,7 +184,7 @@ class Field:
         nodes, weights, scales = self.corners(h, mu_s, active)
         weights = [[w * scales[i // 2][c] for c in range(channels)] for i, w in enumerate(weights)]
         sine = safe_sine(mu)
-        basis = _Harmonics(dr.detach(mu), dr.detach(sine * cos_phi), slopes=dr.grad_enabled(mu, cos_phi))
+        basis = Harmonics(dr.detach(mu), dr.detach(sine * cos_phi), slopes=dr.grad_enabled(mu, cos_phi))
         moments, phases, recurrences, degrees = self._tables
         # Together: one kernel makes the derivatives by all that the loop reads.
         moments, phases, *weights = together([moments, phases, *(w for of_node in weights for w in of_node)])
@@ -211,58 +214,42 @@ class Field:
             steps = mu - basis.mu, sine * cos_phi - basis.x
             for step, slopes in zip(steps, sums[1:], strict=True):
                 total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
+        if self._steep(h, mu_s):
+            total = [a + b for a, b in zip(total, self._moved(h, mu_s, basis, active), strict=True)]
         solar = self.optics.spread(width).solar
         return [[e * v for e, v in zip(solar, total[n * channels :], strict=False)] for n in range(kinds)]
 
+    def _steep(self, h: Any, mu_s: Any) -> bool:
+        """Whether derivatives by a place or sun, of a fine solve, pass through look-ups there."""
+        return self.grid.resolution.twice and dr.grad_enabled(h, mu_s)
 
-class _Harmonics:
-    """Real spherical harmonics cos(m phi) P_lm(mu) by recurrence over the pairs (l, m), and their slopes.
+    def _moved(self, h: Any, mu_s: Any, basis: Harmonics, active: Any) -> list[Any]:
+        """0, with the derivatives of what ``unclipped`` sums by level and sun: [scatterer x channel]."""
+        t, channels, kinds = types(), self.optics.channel_count, len(self.optics.scatterers)
+        moved, parts = steep_nodes(self.grid, self.reference, self._guide, h, mu_s, active)
+        total = [0.0] * (kinds * channels)
+        with dr.suspend_grad():
+            moments, phases, recurrences, degrees = (dr.detach(v) for v in self._tables)
+            basis, stride = Harmonics(basis.mu, basis.x, slopes=False), dr.opaque(t.UInt, pair_count(self.degree), 1)
 
-    As polynomials in mu and x = sin(theta) cos(phi), which are smooth at the zenith as well: P_lm has the factor
-    sin^m(theta), and sin^m cos(m phi) follows from q_(m+1) = 2 x q_m - sin^2 q_(m-1).
-    """
+            def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
+                (value,), state = basis.next(packet(recurrences, i, 4, active), state)
+                degree = t.UInt(dr.gather(t.Float, degrees, i, active))
+                chi = row(phases, degree, kinds * channels, active=active, alone=True)
+                new, size = [], padded(channels)
+                for (nodes, weights), old in zip(parts, sums, strict=True):
+                    corner = [packet(moments, node * stride + i, size, active, alone=True) for node in nodes]
+                    slope = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
+                    new.append([dr.fma(value, chi[n] * slope[n % channels], s) for n, s in enumerate(old)])
+                return i + 1, state, new
 
-    def __init__(self, mu: Any, x: Any, *, slopes: bool) -> None:
-        self.mu, self.x, self.slopes = mu, x, slopes
-        self.count = 3 if slopes else 1
-        self._square = (1.0 - mu) * (1.0 + mu)
-
-    def start(self, width: int) -> list[Any]:
-        """m of the pair before the first; P over sin^m at it, its last two in l; q_m and q_(m-1); then all slopes: of P
-        by mu, of q by x and by mu."""
-        t = types()
-        zero, one = dr.zeros(t.Float, width), dr.full(t.Float, 1.0, width)
-        state = [t.Float(0.0) + zero, one * 0.28209479, zero + 0.0, zero + 0.0, one + 0.0, zero + 0.0]
-        return state + [zero + 0.0 for _ in range(6 if self.slopes else 0)]
-
-    def next(self, recurrence: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
-        """Values at the next pair (the harmonic, its slopes by mu and x), and the state there."""
-        a, b, start, is_diagonal = recurrence
-        m, diagonal, last, before, q, q_before, *slopes = state
-        new_m, first = start > 0.0, is_diagonal > 0.0
-        twice = dr.select(m > 0.0, 2.0, 1.0)
-        diagonal = dr.select(new_m, diagonal * start, diagonal)
-        p = dr.select(first, diagonal, a * (self.mu * last - b * before))
-        q_next = dr.select(new_m, twice * self.x * q - self._square * q_before, q)
-        values, new = [p * q_next], []
-        if self.slopes:
-            p_last, p_before, x_q, x_before, mu_q, mu_before = slopes
-            p_mu = dr.select(first, 0.0, a * (last + self.mu * p_last - b * p_before))
-            x_next = dr.select(new_m, twice * (q + self.x * x_q) - self._square * x_before, x_q)
-            mu_next = dr.select(
-                new_m, twice * self.x * mu_q - self._square * mu_before + 2.0 * self.mu * q_before, mu_q
-            )
-            values += [p_mu * q_next + p * mu_next, p * x_next]
-            new = [
-                p_mu,
-                dr.select(first, 0.0, p_last),
-                x_next,
-                dr.select(new_m, x_q, x_before),
-                mu_next,
-                dr.select(new_m, mu_q, mu_before),
-            ]
-        old = [dr.select(first, 0.0, last), q_next, dr.select(new_m, q, q_before)]
-        return values, [dr.select(new_m, m + 1.0, m), diagonal, p, *old, *new]
+            sums = [[dr.zeros(t.Float, dr.width(h)) for _ in total] for _ in parts]
+            state = (t.UInt(0), basis.start(dr.width(h)), sums)
+            *_, slopes = dr.while_loop(state, lambda i, *_: i < stride, pair, label="slopes")
+            dr.eval(slopes)
+        for step, of_step in zip(moved, slopes, strict=True):
+            total = [dr.fma(step, slope, value) for slope, value in zip(of_step, total, strict=True)]
+        return total
 
 
 def _blend(weights: list[Any], values: list[Any]) -> Any:
@@ -273,20 +260,20 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
 
 
 def _between_levels(grid: Grid, values: Any, length: int) -> Any:
-    """[K, length] -> [levels, length]: cubic in the altitude coordinate."""
-    t = types()
+    """[K, length] -> [levels, length]: by the polynomial in the altitude coordinate through four nodes, or six where
+    derivatives are wanted."""
+    t, count = types(), min(6 if grid.resolution.twice else 4, grid.shape[0])
 
     def taps() -> tuple[Any, Any]:
         level = np.arange(grid.level_count) / grid.refine
-        first = np.clip(np.floor(level).astype(int) - 1, 0, max(grid.shape[0] - 4, 0))
-        nodes = (first[:, None] + np.arange(min(4, grid.shape[0]))).astype(float)
+        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, grid.shape[0] - count)
+        nodes = (first[:, None] + np.arange(count)).astype(float)
         return uints(first), floats(lagrange(nodes, level))
 
     first, weights = grid.kept("between levels", taps)
     lane = dr.arange(t.UInt, grid.level_count * length)
     level, place = lane // length, lane % length
-    start, count = dr.gather(t.UInt, first, level), min(4, grid.shape[0])
-    total = 0.0
+    start, total = dr.gather(t.UInt, first, level), 0.0
     for i in range(count):
         value = dr.gather(t.Float, values, (start + i) * length + place)
         total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)

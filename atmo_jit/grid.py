@@ -28,7 +28,6 @@ NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
 REMEMBERED = 8  # grids kept with all that was built on them
 _DEEP_SHARES = 0.5, 2.0  # of bottom and top in deep air, whose light all comes through its top
-_TWILIGHT = 4.0  # sun nodes lie this much closer (plus one) at twilight than by day
 
 
 class Grid(Keeper):
@@ -96,7 +95,7 @@ class Grid(Keeper):
         self.kinks_m = corners(profiles or atmosphere)[1:-1]
         self._kept: dict[Any, Any] = {}
         self._place_altitudes(atmosphere, resolution)
-        self._place_suns(resolution.suns, resolution.sun_refine, resolution.first_suns, suns)
+        self._place_suns(resolution, suns)
 
     def _place_altitudes(self, atmosphere: Atmosphere, resolution: Resolution) -> None:
         count, refine = resolution.altitudes, resolution.refine
@@ -145,14 +144,15 @@ class Grid(Keeper):
         levels[0], levels[-1] = 0.0, self.thickness_m
         return levels
 
-    def _place_suns(self, count: int, refine: int, first: int, suns: tuple[float, float] | None) -> None:
+    def _place_suns(self, resolution: Resolution, suns: tuple[float, float] | None) -> None:
+        count, refine, first = resolution.suns, resolution.sun_refine, resolution.first_suns
         # The light fades over the dip of the horizon seen from the top, once for single scattering and once more for
         # multiple.
         dip = np.arccos(self.radius_m / (self.radius_m + self.thickness_m))
         end = min(0.5 * np.pi + 2.2 * dip, np.pi)
         self._center, self._width = 0.5 * np.pi + 0.3 * dip, 0.8 * dip
         theta = np.linspace(0.0, end, 4 * _FINE)
-        self._scale = 1.0
+        self._bend, self._scale = resolution.twilight * self._width, 1.0
         self._scale = (count - 1) / self._sun_coordinate(end)
         position = self._sun_coordinate(theta)
         low, high = 0, count - 1
@@ -171,7 +171,7 @@ class Grid(Keeper):
 
     def _sun_coordinate(self, theta: np.ndarray | float) -> np.ndarray:
         bend = np.arctan((theta - self._center) / self._width) + np.arctan(self._center / self._width)
-        return self._scale * (theta + _TWILIGHT * self._width * bend)
+        return self._scale * (theta + self._bend * bend)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -184,14 +184,19 @@ class Grid(Keeper):
 
     def prepare(self) -> None:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
-        dr.eval(self._u_buffer, self._sun_map, self._counts)
+        dr.eval(self._u_buffer, self._u_slopes, self._sun_map, self.counts)
 
     @cached_property
     def _u_buffer(self) -> Any:
         return floats(self._u)
 
     @cached_property
-    def _counts(self) -> tuple[Any, Any]:
+    def _u_slopes(self) -> Any:
+        """Slopes of u by altitude at the samples: those between two of them jump, near the ground by 2 per cent."""
+        return floats(np.gradient(self._u, self._h_of_u))
+
+    @cached_property
+    def counts(self) -> tuple[Any, Any]:
         """Of levels and of refined suns, which kernels read from memory: they serve grids of other sizes too."""
         return dr.opaque(types().UInt, self.level_count, 1), dr.opaque(types().UInt, self.sources, 1)
 
@@ -205,18 +210,23 @@ class Grid(Keeper):
         start = t.Float(cell)
         fraction = dr.fma(share, float(_FINE**2), -start * start) / dr.fma(2.0, start, 1.0)
         u0, u1 = dr.gather(t.Float, self._u_buffer, cell), dr.gather(t.Float, self._u_buffer, cell + 1)
-        return split(dr.lerp(u0, u1, fraction) * float(self.refine), self._counts[0])
+        u = dr.lerp(u0, u1, dr.detach(fraction))
+        if dr.grad_enabled(h):
+            slopes = (dr.gather(t.Float, self._u_slopes, cell + i) for i in (0, 1))
+            u = dr.fma(h - dr.detach(h), dr.lerp(*slopes, dr.detach(fraction)), u)
+        return split(u * float(self.refine), self.counts[0])
 
     @cached_property
     def _sun_map(self) -> list[Any]:
-        return [parameter(v) for v in (self._center, self._width, self._scale, self.sun_offset, self.shape[1] - 1.0)]
+        places = self._center, self._width, self._bend, self._scale, self.sun_offset, self.shape[1] - 1.0
+        return [parameter(v) for v in places]
 
     def sun_position(self, mu_s: Any) -> Any:
         """Sun coordinate of cos(sun zenith) ``mu_s``: s at node s, clipped to the first and the last."""
-        center, width, scale, offset, last = self._sun_map
+        center, width, bend, scale, offset, last = self._sun_map
         theta = dr.safe_acos(mu_s)
-        bend = dr.atan((theta - center) / width) + dr.atan(center / width)
-        return dr.clip(scale * dr.fma(_TWILIGHT * width, bend, theta) - offset, 0.0, last)
+        turned = dr.atan((theta - center) / width) + dr.atan(center / width)
+        return dr.clip(scale * dr.fma(bend, turned, theta) - offset, 0.0, last)
 
     def locate_sun(self, mu_s: Any) -> tuple[Any, Any]:
         """Index of the refined sun before ``mu_s`` and the fraction of the way to the next."""
@@ -224,11 +234,11 @@ class Grid(Keeper):
 
     def locate_source(self, x: Any) -> tuple[Any, Any]:
         """The same by the sun coordinate ``x``."""
-        return split(x * float(self.sun_refine), self._counts[1])
+        return split(x * float(self.sun_refine), self.counts[1])
 
     def node(self, level: Any, source: Any) -> Any:
         """Index of a level's node under a refined sun."""
-        return level * self._counts[1] + source
+        return level * self.counts[1] + source
 
 
 def arrays_in(*things: Any) -> list[Any]:

@@ -13,10 +13,11 @@ from typing import Any
 import drjit as dr
 
 from ._trees import flat, like
-from .backend import evaluated, sum_loop, together, types
+from .backend import evaluated, parameter, sum_loop, together, types
 from .column import SunColumns
 from .field import Field
 from .geometry import UPRIGHT, altitude_along
+from .levels import corners
 from .march import (
     NODES,
     Cuts,
@@ -33,6 +34,9 @@ from .ray_sums import RaySums
 
 LEVEL = 0.02  # cosine of a zenith angle: a ray nearer to the horizontal leaves a level too slowly to tell where
 TWICE = (0.5 - 12.0**-0.5, 0.5 + 12.0**-0.5)  # of a piece: Gauss points, where fine solves ask for the field
+# Of a ray's first piece: beside the observer the derivative by its altitude asks for more than two places.
+FIRST_PART = 0.15
+WHOLE = 0.999  # of a piece is all of it
 # Share of light that a piece scatters: below it the derivative of its centroid, which has the square of that below the
 # line, leaves single precision.
 NOTHING = 1e-18
@@ -58,18 +62,23 @@ class Pieces:
         return dr.width(self.start)
 
     @classmethod
-    def of(cls, optics: Optics, rays: Rays) -> Pieces | None:
-        """The pieces that march.march would integrate; None: no ray meets air."""
+    def of(cls, optics: Optics, rays: Rays, *, fine: bool = False) -> Pieces | None:
+        """The pieces that march.march would integrate; None: no ray meets air. ``fine``: of the first FIRST_PART is a
+        piece of its own."""
         t, kinds = types(), len(optics.constituents)
         if not kinds:
             return None
         with dr.suspend_grad():
-            cuts, rule = Cuts(optics, rays), Rule(1)
+            cuts, rule, part = Cuts(optics, rays), Rule(1), t.Bool(fine)
             width = dr.width(rays.h, rays.mu, rays.nu, rays.stop)
 
             def cut(store: Any) -> Any:
                 def piece(d: Any, shell: Any, amounts: list[Any], number: Any) -> tuple[Any, ...]:
-                    end, shell = cuts.after(d, shell, amounts)
+                    end, after = cuts.after(d, shell, amounts)
+                    # Its second part ends where all of it would.
+                    whole = dr.select(number == 0, FIRST_PART * end, d * (1.0 / FIRST_PART))
+                    parted = part & ((number == 0) | ((number == 1) & (whole < WHOLE * end)))
+                    end, shell = dr.select(parted, whole, end), dr.select(parted, shell, after)
                     if store is not None:
                         store(number, d, end)
                     density = [
@@ -215,16 +224,26 @@ def _asked(optics: Optics, source: Field, rays: Rays, distance: Any, active: Any
 
 
 def _at_its_level(optics: Optics, rays: Rays, distance: Any) -> Any:
-    """0, with the derivative of a ``distance`` at which a ray has one altitude, whatever its direction.
+    """0, with the derivative of a ``distance`` at which a ray has one altitude, whatever its direction; from a higher
+    observer that altitude is higher too, the less so the farther it is, and not at corners of profiles.
 
-    The source is asked once for every piece, and exact where it is linear over it: what that leaves out changes little
-    from ray to ray as long as rays are cut at the same altitudes.
+    The source is asked a few times for every piece, and exact where it is linear over it: what that leaves out changes
+    little from ray to ray as long as rays are cut at the same altitudes, and between observers as long as all pieces
+    move, and none grows.
     """
     h, mu = dr.detach(rays.h), dr.detach(rays.mu)
-    r = optics.radius + h
-    rises = dr.fma(r, mu, distance)  # r there, times the cosine of the zenith angle
-    steep = (dr.abs(rises) > LEVEL * r) & (distance > 0.0)
-    moves = r * distance * (rays.mu - mu) + dr.fma(mu, distance, r) * (rays.h - h)
+    r, d = optics.radius + h, dr.detach(distance)
+    low, high = dr.zeros(type(h), dr.width(h)), optics.thickness + 0.0 * h
+    for corner in (parameter(level) for level in corners(optics.atmosphere)[1:-1]):
+        low = dr.select(corner <= h, dr.maximum(corner, low), low)
+        high = dr.select(corner > h, dr.minimum(corner, high), high)
+    there = altitude_along(optics.radius, h, mu, d)[0]
+    end = dr.select(there > h, high, low)
+    follows = dr.clip((end - there) / dr.select(end != h, end - h, 1.0), 0.0, 1.0)
+    rises = dr.fma(r, mu, d)  # r there, times the cosine of the zenith angle
+    steep = (dr.abs(rises) > LEVEL * r) & (d > 0.0)
+    higher = dr.fma(mu, d, r) - follows * (r + there - h)
+    moves = r * d * (rays.mu - mu) + higher * (rays.h - h)
     return dr.select(steep, -moves / dr.select(steep, rises, 1.0), 0.0)
 
 

@@ -25,8 +25,8 @@ AIR_MASS = 20.0  # of rays two degrees above the horizon, where light of high de
 NEAR_GROUND = 1.0  # see Resolution.near_ground
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 # More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
-FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 12
-FINE_ORDERS = 2  # azimuthal orders more
+FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 20
+FINE_NEAR_GROUND, FINE_TWILIGHT, FINE_ORDERS = 2.0, 8.0, 2  # see Resolution; azimuthal orders more
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -56,8 +56,8 @@ class Resolution:
     ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
     steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
     ``near_ground``: so many times as many altitudes as follow a constituent are spread evenly over the logarithm of
-    the altitude, but for clouds, whose light passes the top; ``twice``: derivatives ask for the field at two places
-    of every piece of a ray.
+    the altitude, but for clouds, whose light passes the top; ``twilight``: so many times closer, plus one, sun nodes
+    lie then than by day; ``twice``: derivatives ask for the field at two places of every piece of a ray.
     ``deep``: altitudes are denser at the top than at the bottom: all the light of a white cloud passes there twice.
     """
 
@@ -81,6 +81,7 @@ class Resolution:
     columns: tuple[int, int] = (128, 96)
     deep: bool = False
     near_ground: float = 0.0
+    twilight: float = 4.0
     twice: bool = False
 
     @property
@@ -95,8 +96,8 @@ class Resolution:
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l is l g^(l -
         1), which fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's;
-        so all orders have all degrees, and two azimuthal orders more. Order 1 has four times as many suns, look-ups
-        twice as many levels and suns, and rays ask for the field twice a piece.
+        so all orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground, suns at
+        twilight, look-ups have twice as many levels, and rays ask for the field twice a piece.
         """
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
@@ -119,12 +120,12 @@ class Resolution:
         return cls(
             altitudes=_altitudes(atmosphere, altitudes, thick, deep),
             deep=deep,
-            near_ground=NEAR_GROUND if fine or not thick else 0.0,
+            near_ground=FINE_NEAR_GROUND if fine else 0.0 if thick else NEAR_GROUND,
             twice=fine,
             refine=4 if fine else 2,
-            sun_refine=8 if fine else 4,
+            twilight=FINE_TWILIGHT if fine else 4.0,
             suns=(21, 25, 29, 33)[level] + (FINE_SUNS if fine else 0),
-            first_suns=4 if fine else (1, 2, 2, 2)[level],
+            first_suns=2 if fine else (1, 2, 2, 2)[level],
             nodes=4 if thick else 2,
             stages=tuple(dict.fromkeys(stages)),
             first_up=max(10, first),

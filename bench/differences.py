@@ -89,7 +89,8 @@ def finer(resolution: Any, altitudes: float, suns: float, degrees: int, orders: 
         resolution,
         altitudes=int(altitudes * resolution.altitudes),
         suns=int(suns * resolution.suns),
-        first_suns=2,
+        refine=8,
+        sun_refine=16,
         stages=stages,
         nodes=4,
         first_up=degree + 4,
@@ -133,7 +134,7 @@ def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], re
         angles = [doubles(np.radians(where[n])) for n in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
         place = doubles(where["altitude_m"]), *angles
         rays, _, _ = sky.enter(*place)
-        pieces = [Pieces.of(band.optics, rays) for band in sky.solutions]
+        pieces = [Pieces.of(band.optics, rays, fine=True) for band in sky.solutions]
         found = sky.rays(*place, pieces=pieces).radiance
         dr.eval(found)
         return np.stack([v.numpy() for v in found], axis=-1).astype(float)

@@ -409,3 +409,10 @@ def test_files_that_are_not_there(tmp_path):
 def test_a_source_of_the_wrong_type():
     for source in (None, 3, ["earth"], b"earth"):
         assert file_refusal(source).field == "atmosphere"
+
+
+# Rays from the ground took no end: of a metre, and of a radius that single precision has none of.
+@pytest.mark.parametrize(("bottom", "top", "name"), [(1.0, 6.4e6, "top_radius_m"), (1e-50, 2e-50, "bottom_radius_m")])
+def test_planets_too_small_for_their_air(bottom, top, name):
+    error = refusal({"wavelengths_nm": [550], "bottom_radius_m": bottom, "top_radius_m": top})
+    assert error.field == name

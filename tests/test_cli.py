@@ -250,3 +250,10 @@ def test_sky_is_callable_whoever_imports_what_first(imports):
     )
     done = subprocess.run([sys.executable, "-c", f"{imports}\n{check}"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_closed_streams_are_nobodys(closed):
+    command = f"{sys.executable} -m atmo_jit info --preset earth {closed}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
