@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import floats, row, table, uints
+from atmo_jit.backend import floats, row, row_size, table, uints
 from atmo_jit.geometry import UPRIGHT
 from atmo_jit.march import point_along, rays_to_boundary, relative_azimuth, visible_sun
 from atmo_jit.phase import HenyeyGreenstein
@@ -73,11 +73,11 @@ class HiddenLight:
                 lit = self._hidden(ray, 0 if most is None else most - 1 - n)
             light = lit
             if known is not None:
-                again = row(table(known), index, air.count)
+                again = row(floats(known), index, air.count)
                 light = [dr.fma(f, m, v) for f, m, v in zip(ray["factor"], again, lit, strict=True)]
             dr.eval(light)
             known = self._scattered(np.stack(light).reshape(air.count, count, per_node), phases, shares)
-        self._table = table(known[stands_for].reshape(-1, air.count))
+        self._table = floats(known[stands_for])
 
     def _standing(self, leaves: np.ndarray) -> np.ndarray:
         """For each node one that is in the air, near it: itself where it sees the sky in OPEN of its upper half."""
@@ -176,7 +176,7 @@ class HiddenLight:
             nm = list(atmosphere.wavelengths_nm)
             for i in range(0, len(nm), size):
                 some = nm[i : i + size]
-                si.wavelengths = mi.Wavelength(*(float(v) for v in some + [some[-1]] * (size - len(some))))
+                si.wavelengths = type(si.wavelengths)(*(float(v) for v in some + [some[-1]] * (size - len(some))))
                 values = mi.UnpolarizedSpectrum(si.bsdf().eval_diffuse_reflectance(si, active))
                 found += [values[k] for k in range(len(some))]
             return found
@@ -212,9 +212,9 @@ class HiddenLight:
         return (found / np.maximum(found.sum(axis=0), 1e-30)).astype(np.float32)
 
     def _scattered(self, light: np.ndarray, phases: list[np.ndarray], shares: np.ndarray) -> np.ndarray:
-        """Light [W, nodes, directions] scattered once more: [nodes, directions of light, W]."""
+        """Light [W, nodes, directions] scattered once more: rows of a table, [nodes, directions of light, W]."""
         wavelengths, count, _ = light.shape
-        found = np.empty((count, phases[0].shape[-1], wavelengths), dtype=np.float32)
+        found = np.zeros((count, phases[0].shape[-1], row_size(wavelengths)), dtype=np.float32)
         for s in range(SETS):
             own = np.flatnonzero(self._sets == s)
             for c in range(wavelengths):
