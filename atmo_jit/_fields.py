@@ -45,6 +45,7 @@ ANY = Range()
 POSITIVE = Range(0, low_open=True)
 NOT_NEGATIVE = Range(0)
 FRACTION = Range(0, 1)
+LENGTH = Range(1e-3, 1e12)  # m: of scales of profiles; what is shorter or longer is lost in single precision
 
 
 def number(value: Any, name: str, allowed: Range = ANY, *, text: str | None = None) -> float:

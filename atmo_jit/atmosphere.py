@@ -32,7 +32,7 @@ from ._fields import FRACTION, NOT_NEGATIVE, POSITIVE, Range, mapping, number, n
 from ._json import plain, read_json
 from .errors import AtmosphereError, shown, within
 from .phase import Phase, RayleighPhase, phase_from_dict
-from .profile import Profile, profile_from_dict
+from .profile import Profile, Tabulated, profile_from_dict
 
 __all__ = ["Atmosphere", "AtmosphereError", "Constituent"]
 
@@ -51,7 +51,9 @@ RADIUS = Range(0, 1e10, low_open=True)
 FARTHEST_TOP, SMALLEST = 10000.0, 1e-3
 # Every species makes the kernels larger: with this many the first solve takes half a minute, with thousands no end.
 MOST_SPECIES = 64
-SCATTERED_FRACTION = Range(0, 1, low_open=True)
+SCATTERED_FRACTION = Range(1e-12, 1)  # what scatters less has absorption_per_m
+# Columns through denser air, and light of brighter suns, are too much for single precision.
+DENSEST, BRIGHTEST = 1e6, 1e30  # 1/m; W m^-2 nm^-1
 # Keys of which an object holds one or the other: replacing one of them by its dotted name drops the others.
 ALTERNATIVES = (
     ({"single_scattering_albedo"}, {"absorption_per_m"}),
@@ -128,7 +130,7 @@ class Atmosphere:
         self._set(
             _document=document,
             wavelengths_nm=wavelengths,
-            solar_irradiance=per_wavelength(d["solar_irradiance"], "solar_irradiance", count, NOT_NEGATIVE),
+            solar_irradiance=per_wavelength(d["solar_irradiance"], "solar_irradiance", count, Range(0, BRIGHTEST)),
             ground_albedo=per_wavelength(d["ground_albedo"], "ground_albedo", count, FRACTION),
             bottom_radius_m=bottom,
             top_radius_m=top,
@@ -309,6 +311,12 @@ def _ozone(d: Any, count: int) -> Constituent | None:
 def _constituent(
     name: str, scattering: np.ndarray, absorption: np.ndarray, profile: Profile, phase: Phase | None
 ) -> Constituent:
+    densest = float(np.max(profile.values)) if isinstance(profile, Tabulated) else 1.0
+    for key, coefficients in (("scattering_per_m", scattering), ("absorption_per_m", absorption)):
+        most = float(np.max(coefficients))
+        if not most * densest <= DENSEST:
+            allowed = f"at most {DENSEST:g} per metre, times the largest density of the profile ({densest:g})"
+            raise AtmosphereError(f"{name}.{key}", f"up to {most:g}", allowed)
     scattering.flags.writeable = absorption.flags.writeable = False
     return Constituent(name, scattering, absorption, profile, phase)
 

@@ -19,9 +19,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ._arrays import asarray, is_drjit, module_of, piecewise_linear
-from ._fields import NOT_NEGATIVE, POSITIVE, mapping, number, numbers, one_of
+from ._fields import LENGTH, Range, mapping, number, numbers, one_of
 from .errors import AtmosphereError, within
 
+ALTITUDE = Range(0, LENGTH.high)
+# Relative, or molecules per cubic metre beside cross sections.
+DENSITY = Range(0, 1e30)
 
 @dataclass(frozen=True)
 class Exponential:
@@ -31,7 +34,7 @@ class Exponential:
     kinks_m: ClassVar[tuple[float, ...]] = ()
 
     def __post_init__(self) -> None:
-        _check(self, "scale_height_m", POSITIVE)
+        _check(self, "scale_height_m", LENGTH)
 
     def density(self, h: Any) -> Any:
         """Relative density at altitude ``h`` (m)."""
@@ -53,8 +56,8 @@ class Tent:
     half_width_m: float
 
     def __post_init__(self) -> None:
-        _check(self, "center_m", NOT_NEGATIVE)
-        _check(self, "half_width_m", POSITIVE)
+        _check(self, "center_m", ALTITUDE)
+        _check(self, "half_width_m", LENGTH)
 
     @property
     def kinks_m(self) -> tuple[float, ...]:
@@ -84,8 +87,8 @@ class Tabulated:
         if is_drjit(altitude_m):
             self.altitude_m, self.values = altitude_m, density
             return
-        altitude = numbers(altitude_m, "altitude_m", NOT_NEGATIVE)
-        values = numbers(density, "density", NOT_NEGATIVE)
+        altitude = numbers(altitude_m, "altitude_m", ALTITUDE)
+        values = numbers(density, "density", DENSITY)
         if len(altitude) != len(values):
             allowed = f"as many numbers as altitude_m has ({len(altitude)})"
             raise AtmosphereError("density", f"a list of {len(values)}", allowed)

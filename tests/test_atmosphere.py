@@ -238,6 +238,16 @@ def wrong_values():
     yield "mie.2.phase.cos_theta", [-1, 1], "mie.2.phase.values"
     yield "mie.2.phase.values", [0, 0, 0], "mie.2.phase.values"
     yield "mie.3.phase.moments", [0.9, 0.5], "mie.3.phase.moments[0]"
+    # What single precision cannot hold: these made NaN, warnings, or a solve without end.
+    for field in ("rayleigh.scale_height_m", "ozone.half_width_m"):
+        yield from ((field, value, field) for value in (1e-300, 1e300))
+    yield "ozone.center_m", 1e300, "ozone.center_m"
+    yield "mie.1.profile.altitude_m", [0, 1000, 1e4, 1e300], "mie.1.profile.altitude_m[3]"
+    yield "mie.1.profile.density", [1, 1, 1, 1e300], "mie.1.profile.density[3]"
+    yield "mie.1.profile.density", [1, 1, 1, 1e20], "mie.1.scattering_per_m"
+    yield "rayleigh.scattering_per_m", 1e300, "rayleigh.scattering_per_m"
+    yield "mie.0.single_scattering_albedo", 1e-320, "mie.0.single_scattering_albedo"
+    yield "solar_irradiance", 1e300, "solar_irradiance"
 
 
 WRONG = list(wrong_values())
