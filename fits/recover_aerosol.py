@@ -1,7 +1,7 @@
 """From a path-traced hazy sky back to its aerosol: by the tables, then by gradients of the path tracer itself.
 
     python -m atmo_jit.fits.recover_aerosol --out aerosol            # about a minute on 2 cores
-    python fits/recover_aerosol.py --out aerosol --tolerance 0.2     # tables that are coarse, and set right
+    python fits/recover_aerosol.py --out aerosol --tolerance 0.9     # tables that are coarse, and set right
 
 A fisheye picture of a hazy sky is path-traced (``atmosphere_volpath``), noise and all: there is no table in it. The
 aerosol's scattering coefficient and g are then fitted to it with the fast sky of this package. What bias its tables T

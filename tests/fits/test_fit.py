@@ -210,14 +210,14 @@ def test_a_measured_sky_is_followed(reference):
 
 @pytest.mark.slow
 def test_the_path_tracer_takes_the_bias_of_coarse_tables_away():
-    """Tables at a tolerance of 0.2 put g many standard errors off; one step with a path-traced picture leads back."""
+    """Tables at a tolerance of 0.9 put g many standard errors off; one step with a path-traced picture leads back."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("llvm_ad_rgb")
     from atmo_jit.fits.recover_aerosol import HazySky, recover
     from atmo_jit.plugins import register
 
     register()
-    summary, _ = recover(HazySky(), 64, 64, 2, tolerance=0.2)
+    summary, _ = recover(HazySky(), 64, 64, 2, tolerance=0.9)
     assert abs(summary["off_in_standard_errors"][1]) > 4.0
     step = summary["refined"]
     for i, (value, truth) in enumerate(zip(step["values"], summary["truth"], strict=True)):
