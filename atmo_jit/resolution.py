@@ -94,10 +94,10 @@ class Resolution:
         """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
 
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
-        particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l is l g^(l -
-        1), which fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's;
-        so all orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground, suns at
-        twilight, look-ups have twice as many levels, and rays ask for the field twice a piece.
+        particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l, l g^(l - 1),
+        fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
+        orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground, suns at twilight,
+        look-ups have twice as many levels, and rays ask for the field twice a piece.
         """
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD

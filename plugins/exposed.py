@@ -52,3 +52,18 @@ def variables(*objects: Any) -> list[Any]:
         elif type(value).__module__.startswith("atmo_jit.plugins"):
             found += variables(*vars(value).values())
     return found
+
+
+def parameters_of(shapes: list[Any]) -> list[Any]:
+    """The arrays that describe shapes and their surfaces."""
+    found = []
+    for shape in shapes:
+        found += [getattr(value, "array", value) for _, value in mi.traverse(shape)]
+    return found
+
+
+def same(one: list[Any], other: list[Any]) -> bool:
+    """Whether two lists hold the same arrays: what holds an array keeps others from its place in memory."""
+    return len(one) == len(other) and all(
+        a.index == b.index if hasattr(a, "index") else a is b or bool(a == b) for a, b in zip(one, other, strict=True)
+    )

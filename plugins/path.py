@@ -14,7 +14,7 @@ from atmo_jit.solved import Sky
 from . import settings
 from .airlight import Airlight
 from .colours import Colours
-from .exposed import array, host
+from .exposed import array, host, parameters_of, same
 from .exposed_atmosphere import ExposedAtmosphere
 from .globe import Globe
 from .hidden_light import PASSES, HiddenLight
@@ -434,18 +434,3 @@ class AtmospherePath:
 def products(one: list[Any], other: list[Any]) -> list[Any]:
     """Wavelength by wavelength."""
     return [a * b for a, b in zip(one, other, strict=True)]
-
-
-def parameters_of(shapes: list[Any]) -> list[Any]:
-    """The arrays that describe shapes and their surfaces."""
-    found = []
-    for shape in shapes:
-        found += [getattr(value, "array", value) for _, value in mi.traverse(shape)]
-    return found
-
-
-def same(one: list[Any], other: list[Any]) -> bool:
-    """Whether two lists hold the same arrays: what holds an array keeps others from its place in memory."""
-    return len(one) == len(other) and all(
-        a.index == b.index if hasattr(a, "index") else a is b or bool(a == b) for a, b in zip(one, other, strict=True)
-    )
