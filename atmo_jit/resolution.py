@@ -90,19 +90,24 @@ class Resolution:
         return tuple(sorted({self.first_degree, self.first_degree + 1, *(stage.degree + 1 for stage in self.stages)}))
 
     @classmethod
-    def suited(cls, atmosphere: Atmosphere, tolerance: float, *, fine: bool = False) -> Resolution:
+    def suited(
+        cls, atmosphere: Atmosphere, tolerance: float, *, fine: bool = False, air_mass: float = AIR_MASS
+    ) -> Resolution:
         """The resolution for an atmosphere at a relative tolerance (0.01: one per cent).
 
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l, l g^(l - 1),
         fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
         orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground, suns at twilight,
-        look-ups have twice as many levels, and rays ask for the field twice a piece.
+        look-ups have twice as many levels, and rays ask for the field twice a piece. ``air_mass``: of the longest view
+        and of the lowest sun, for a sky of which only that is asked: high views need fewer degrees.
         """
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
-        first = _degree(atmosphere, 1, 2, 0.5 * tolerance)
-        later = min(_degree(atmosphere, 2, 3, (0.01 if thick else 0.1) * tolerance), first)
+        first = _degree(atmosphere, 1, 2, 0.5 * tolerance, air_mass)
+        # What later orders lack shows along the horizon; the power is what `python -m bench.fits kider` bears.
+        least = (0.01 if thick else 0.1) * tolerance * (AIR_MASS / air_mass) ** 0.5
+        later = min(_degree(atmosphere, 2, 3, least, air_mass), first)
         deep = float(np.max(np.multiply(*_scattering(atmosphere)))) > DEEP
         if thick:
             first, later = min(first, DEEP_DEGREE if deep else THICK_DEGREE), min(later, 8)
@@ -158,7 +163,7 @@ def _stage(degree: int) -> Stage:
     return Stage(degree, most, max(5, degree + 2), max(3, degree), most + 1 + (most == 2))
 
 
-def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> int:
+def _degree(atmosphere: Atmosphere, events: int, power: int, target: float, air_mass: float) -> int:
     """Smallest degree >= 2 beyond which share^events * |chi_l|^power * sqrt(2 l + 1) stays below ``target`` for every
     scatterer; at most the largest offered."""
     needed = 2
@@ -167,7 +172,7 @@ def _degree(atmosphere: Atmosphere, events: int, power: int, target: float) -> i
             continue
         # How much of the light they meet these particles scatter.
         depth = constituent.scattering_per_m * column_of(atmosphere, constituent)
-        share = -np.expm1(-AIR_MASS * depth) * constituent.single_scattering_albedo
+        share = -np.expm1(-air_mass * depth) * constituent.single_scattering_albedo
         shares: dict[Any, float] = {}
         for wavelength, part in enumerate(share.tolist()):
             phase = constituent.phase.at(wavelength)

@@ -19,7 +19,7 @@ import numpy as np
 from atmo_jit.atmosphere import Atmosphere
 from atmo_jit.backend import doubles
 from atmo_jit.optics import MAX_CHANNELS
-from atmo_jit.resolution import Resolution, column_of
+from atmo_jit.resolution import AIR_MASS, Resolution, column_of
 from atmo_jit.solved import Sky
 
 from .light import RayLight
@@ -40,7 +40,7 @@ class SkyModel:
     """Radiance of samples (``altitude_m``, ``view_zenith`` [N], radians) for changed values of ``atmosphere``.
 
     ``spectral``: dotted names of values per wavelength that will change; ``others``: of plain numbers (scale heights).
-    ``tolerance``: of the sky.
+    ``tolerance``: of the sky. ``air_mass``: of the longest view and of the lowest sun, see :func:`air_mass`.
     """
 
     def __init__(
@@ -51,8 +51,9 @@ class SkyModel:
         tolerance: float,
         spectral: tuple[str, ...],
         others: tuple[str, ...] = (),
+        air_mass: float = AIR_MASS,
     ) -> None:
-        self.atmosphere, self.tolerance = atmosphere, tolerance
+        self.atmosphere, self.tolerance, self.air_mass = atmosphere, tolerance, air_mass
         self.altitude_m, self.view_zenith = altitude_m, view_zenith
         self.spectral, self.others = spectral, others
         self._layout: Atmosphere | None = None
@@ -67,7 +68,8 @@ class SkyModel:
         """The model for other samples, other wavelengths, another tolerance; with the same nodes if neither is given.
         """
         air, tolerance = atmosphere or self.atmosphere, tolerance or self.tolerance
-        other = SkyModel(air, data.altitude_m, data.view_zenith, tolerance, self.spectral, self.others)
+        kinds = self.spectral, self.others
+        other = SkyModel(air, data.altitude_m, data.view_zenith, tolerance, *kinds, air_mass(data))
         if air is self.atmosphere and tolerance == self.tolerance:
             other._resolution, other._rough, other._layout = self._resolution, self._rough, self._layout
         return other
@@ -75,16 +77,19 @@ class SkyModel:
     def place(self, values: Values) -> None:
         """Choose resolution and nodes for these values; they stay, so that skies differ by their values only."""
         self._layout = self.atmosphere.replace(values)
-        self._resolution = Resolution.suited(self._layout, self.tolerance)
-        self._rough = Resolution.suited(self._layout, max(self.tolerance, ROUGH))
+        self._resolution = self._suited(values, self.tolerance)
+        self._rough = self._suited(values, max(self.tolerance, ROUGH))
         self.layout_number += 1
         self._lights.clear()
         self._skies.clear()
 
     def too_coarse(self, values: Values) -> bool:
         """Whether the resolution in use was chosen for an atmosphere that asks for less than this."""
-        needed, used = Resolution.suited(self.atmosphere.replace(values), self.tolerance), self._resolution
+        needed, used = self._suited(values, self.tolerance), self._resolution
         return needed.first_degree > used.first_degree or needed.altitudes > used.altitudes
+
+    def _suited(self, values: Values, tolerance: float) -> Resolution:
+        return Resolution.suited(self.atmosphere.replace(values), tolerance, air_mass=self.air_mass)
 
     def strays(self, values: Values) -> bool:
         """Whether the nodes in use were placed for much thinner or thicker air."""
@@ -208,6 +213,12 @@ class SkyModel:
     def _solved(self, air: Atmosphere, layout: Atmosphere, resolution: Resolution, sun_zenith: np.ndarray) -> Sky:
         tolerance = self.tolerance if resolution == self._resolution else ROUGH
         return Sky(air, tolerance=tolerance, resolution=resolution, suns=_suns(sun_zenith), layout=layout)
+
+
+def air_mass(data: Observations) -> float:
+    """That of the longest view and of the lowest sun (plane layers), as far as that tells resolutions apart."""
+    lowest = min(float(np.cos(data.view_zenith).min()), float(np.cos(data.sun_zenith).min()))
+    return 1.0 / max(lowest, 1.0 / AIR_MASS)
 
 
 def _suns(sun_zenith: np.ndarray) -> tuple[float, float]:

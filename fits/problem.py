@@ -24,7 +24,7 @@ import numpy as np
 from atmo_jit.wavelengths import at_wavelengths
 
 from .config import FitConfig
-from .forward import SkyModel
+from .forward import SkyModel, air_mass
 from .observations import Observations
 from .parameters import Leaf, Scalar, leaf_of
 
@@ -75,7 +75,8 @@ class Problem:
         leaves = tuple(leaf_of(config.atmosphere, name, spec) for name, spec in config.free.items())
         spectral = tuple(x.name for x in leaves if np.ndim(x.values(_starts(x))) or x.name.endswith(".g"))
         others = tuple(leaf.name for leaf in leaves if leaf.name not in spectral)
-        model = SkyModel(config.atmosphere, data.altitude_m, data.view_zenith, config.tolerance, spectral, others)
+        views = data.altitude_m, data.view_zenith
+        model = SkyModel(config.atmosphere, *views, config.tolerance, spectral, others, air_mass(data))
         return cls(config, data, model, leaves)
 
     def with_loss(self, huber: float, excess: float) -> Problem:

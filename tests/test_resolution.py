@@ -64,6 +64,21 @@ def test_haze_with_a_narrow_peak_has_no_ripple():
     assert light[0] == pytest.approx(light[1], rel=0.01)
 
 
+def test_views_that_keep_away_from_the_horizon_need_fewer_degrees():
+    aerosol = {"mie.scattering_per_m": 3e-5, "mie.phase": {"type": "henyey_greenstein", "g": 0.94}}
+    air = EARTH.replace({**aerosol, "mie.scale_height_m": 1500.0})
+    usual, high = Resolution.suited(air, 0.02), Resolution.suited(air, 0.02, air_mass=5.0)
+    assert high.stages[0].degree < 0.75 * usual.stages[0].degree
+    zenith, azimuth = (v.ravel() for v in np.meshgrid(np.radians([0.0, 40.0, 78.0]), np.radians([5.0, 60.0, 180.0])))
+    rays = [np.zeros(len(zenith)), np.full(len(zenith), np.radians(40.0)), zenith, azimuth]
+    exact = {"first_degree": 48, "first_up": 60, "first_down": 58, "first_azimuths": 64, "phase_degree": 64}
+    light = []
+    for resolution in (high, replace(Resolution.suited(air, 0.002), **exact)):
+        found = Sky(air, tolerance=0.002, resolution=resolution).rays(*map(doubles, rays)).radiance
+        light.append(np.stack([channel.numpy() for channel in found]))
+    assert light[0] == pytest.approx(light[1], rel=0.02)
+
+
 def test_as_many_moments_as_are_asked_for():
     few, many = (moments_of(HenyeyGreenstein(0.83), degree) for degree in (10, 60))
     assert len(few) == 11 and many == pytest.approx(0.83 ** np.arange(61))
