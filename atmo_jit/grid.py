@@ -114,8 +114,8 @@ class Grid(Keeper):
                 depth = depth + (2.0**rounded / column * density * step if rounded > -2 else 0.0)
                 self._bounds.append((c.profile, 2.0 ** (rounded + 0.5) / column))
             share = density ** (1.0 / 3.0) * step
-            if scatters and share.sum() > 0:
-                rise = rise + share / share.sum()
+            if share.sum() > 0:
+                rise = rise + (1.0 if scatters else resolution.absorbers) * share / share.sum()
         # On a plane light near a level bottom changes as h ln h: nearly level rays there see the ground or do not.
         near = np.diff(np.log1p(h / NEAREST))
         rise = rise + resolution.near_ground * near / near.sum()

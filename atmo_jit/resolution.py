@@ -56,8 +56,9 @@ class Resolution:
     ``orders``: most orders solved one by one, before all that follow are at once (remainder.py); fewer where the sum is
     steady to ``converged`` times the tolerance. ``columns``: size of the sun-column table (altitudes, cosines).
     ``near_ground``: so many times as many altitudes as follow a constituent are spread evenly over the logarithm of
-    the altitude, but for clouds, whose light passes the top; ``twilight``: so many times closer, plus one, sun nodes
-    lie then than by day; ``twice``: derivatives ask for the field at two places of every piece of a ray.
+    the altitude, but for clouds, whose light passes the top; ``absorbers``: and so many times as many follow each that
+    only absorbs, whose light changes where the layer has corners; ``twilight``: so many times closer, plus one, sun
+    nodes lie then than by day; ``twice``: derivatives ask for the field at two places of every piece of a ray.
     ``deep``: altitudes are denser at the top than at the bottom: all the light of a white cloud passes there twice.
     """
 
@@ -81,6 +82,7 @@ class Resolution:
     columns: tuple[int, int] = (128, 96)
     deep: bool = False
     near_ground: float = 0.0
+    absorbers: float = 0.0
     twilight: float = 4.0
     twice: bool = False
 
@@ -98,9 +100,10 @@ class Resolution:
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l, l g^(l - 1),
         fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
-        orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground, suns at twilight,
-        look-ups have twice as many levels, and rays ask for the field twice a piece. ``air_mass``: of the longest view
-        and of the lowest sun, for a sky of which only that is asked: high views need fewer degrees.
+        orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground and where air only
+        absorbs, suns at twilight, look-ups have twice as many levels, and rays ask for the field twice a piece.
+        ``air_mass``: of the longest view and of the lowest sun, for a sky of which only that is asked: high views need
+        fewer degrees.
         """
         # So many orders that no single one keeps its direction, and that what each lacks is lost once for each.
         thick = float(np.max(_depth(atmosphere))) > CLOUD
@@ -126,6 +129,7 @@ class Resolution:
             altitudes=_altitudes(atmosphere, altitudes, thick, deep),
             deep=deep,
             near_ground=FINE_NEAR_GROUND if fine else 0.0 if thick else NEAR_GROUND,
+            absorbers=1.0 if fine else 0.0,
             twice=fine,
             refine=4 if fine else 2,
             twilight=FINE_TWILIGHT if fine else 4.0,

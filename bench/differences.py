@@ -27,6 +27,8 @@ VIEWS, NEAR = 20, 4  # directions, and those within a degree of the horizon
 SMALL = 0.05
 STEPS = {"altitude_m": 20.0, "sun_zenith_deg": 0.1, "view_zenith_deg": 0.1, "azimuth_deg": 1.0, "mie.phase.g": 0.01}
 NARROW = {"single_scattering_albedo": 0.004, "ground_albedo": 0.02}  # which end at 1
+# Light hardly changes by these: single precision needs longer steps.
+WIDE = {"center_m": 0.06, "half_width_m": 0.06, "absorption_per_m": 0.2}
 STEP = 0.03  # relative, of all others: single precision leaves 3e-5 of a logarithmic derivative
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0))
 LIMITS = ("beyond a degree of the horizon", 1e-3), ("within a degree of it", 1e-2)
@@ -147,7 +149,7 @@ def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], re
                 ends = [(w, light(air, views | {name: views[name] + s * step})) for s, w in STENCIL]
             else:
                 value = np.asarray(described(air, name))
-                step = STEPS.get(name, NARROW.get(name.rpartition(".")[2], STEP) * value)
+                step = STEPS.get(name, (NARROW | WIDE).get(name.rpartition(".")[2], STEP) * value)
                 ends = [(w, light(air.replace({name: (value + s * step).tolist()}), views)) for s, w in STENCIL]
             found[name] = sum(w * end for w, end in ends) / step
     return found

@@ -71,6 +71,13 @@ def test_nodes_near_the_ground():
     assert fine.h[1] < usual.h[1] / 4 and len(fine.h) == len(usual.h)
 
 
+def test_nodes_in_a_layer_that_absorbs():
+    """As many altitudes, more of them where the layer is."""
+    usual, fine = (grid(altitudes=18, absorbers=share) for share in (0.0, 1.0))
+    inside = [np.count_nonzero((g.h > 10e3) & (g.h < 40e3)) for g in (usual, fine)]
+    assert inside[1] >= inside[0] + 3 and len(fine.h) == len(usual.h)
+
+
 def _as_float(index):
     return types().Float(index)
 
