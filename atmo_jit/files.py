@@ -159,6 +159,9 @@ def read_npz(path: str | os.PathLike[str], *, kinds: str = KINDS, limit: int = N
     """
     name = shown(str(path), 200)
     try:
+        mode = os.stat(path).st_mode  # before it is opened: a pipe would wait, and the end of a device be looked for
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError(f"{name}: is not a file")
         with open(path, "rb") as file:
             if os.fstat(file.fileno()).st_size > limit:
                 raise InputError(f"{name}: the file is larger than {limit} bytes")

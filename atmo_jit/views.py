@@ -8,7 +8,7 @@ Both return a plain dict of float64 arrays [N], in the units that the names carr
 ==================  =======================  ==================================================================
 array               allowed                  meaning
 ==================  =======================  ==================================================================
-``altitude_m``      finite, >= 0             height of the observer above the planet's surface
+``altitude_m``      0 to 1e30                height of the observer above the planet's surface
 ``sun_zenith_deg``  0 to 180                 angle between the zenith and the sun at the observer
 ``view_zenith_deg`` 0 to 180                 angle between the zenith and the view ray at the observer
 ``azimuth_deg``     finite                   view azimuth minus sun azimuth, 0 = towards the sun; any turn, any sign
@@ -34,6 +34,7 @@ from atmo_jit.files import read_npz
 
 # Single-precision radians turned into degrees are off by up to 1.5e-5; a real mistake is never this small.
 ANGLE_SLACK_DEG = 1e-4
+FARTHEST_M = 1e30  # squares of it still fit into double precision, and it into single
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class _Range:
 
 
 _RANGES = {
-    "altitude_m": _Range(0.0, np.inf, "finite numbers >= 0"),
+    "altitude_m": _Range(0.0, FARTHEST_M, f"numbers from 0 to {FARTHEST_M:g}"),
     "sun_zenith_deg": _Range(0.0, 180.0, "numbers from 0 to 180", slack=ANGLE_SLACK_DEG),
     "view_zenith_deg": _Range(0.0, 180.0, "numbers from 0 to 180", slack=ANGLE_SLACK_DEG),
     "azimuth_deg": _Range(-np.inf, np.inf, "finite numbers"),
@@ -132,6 +133,8 @@ def _in_range(values: np.ndarray, name: str, where: str) -> np.ndarray:
     if not inside.all():
         index = int(np.argmin(inside))
         raise InputError(f"{where}: {name}[{index}] is {float(values[index])!r}; allowed are {allowed.text}")
+    if name == "azimuth_deg":  # whole turns, exactly, which radians in single precision cannot leave out
+        values = np.where(np.abs(values) > 360.0, np.fmod(values, 360.0), values)
     return np.clip(values, allowed.low, allowed.high) + 0.0  # + 0.0: a fresh array, and -0 becomes 0
 
 

@@ -25,6 +25,7 @@ empty cell or ``nan`` is no sample. Lines that begin with # are skipped.
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +42,7 @@ AZIMUTHS = ("azimuth_deg", "sun_azimuth_deg", "view_azimuth_deg")
 NAMES = ("radiance", "sigma", "relative_sigma", "wavelengths_nm", *PLACES, *AZIMUTHS, "scan", "mask")
 DEFAULT_RELATIVE_SIGMA = 0.01
 CSV_LIMIT = 2**28
+CELLS_LIMIT = 2**26  # samples times wavelengths of a CSV, which may name a wavelength of its own in every row
 WAVELENGTHS_NM = (100.0, 1e5)  # below, they are in micrometres
 
 
@@ -198,8 +200,9 @@ def _scan(scan: Any, count: int, where: str) -> np.ndarray:
     if scan is None:
         return np.zeros(count, int)
     scan = _column(scan, "scan", count, where)
-    if not np.all(np.isfinite(scan) & (scan == np.round(scan))):
-        raise InputError(f"{where}: scan holds {scan[scan != np.round(scan)][0]:g}; must be whole numbers")
+    whole = np.isfinite(scan) & (scan == np.round(scan))
+    if not whole.all():
+        raise InputError(f"{where}: scan holds {scan[~whole][0]:g}; must be whole numbers")
     return np.unique(scan, return_inverse=True)[1].ravel()
 
 
@@ -227,9 +230,11 @@ def _read_csv(path: Path) -> dict[str, Any]:
     """The columns of a CSV as arrays, radiance and what belongs to it as [N, W]."""
     name = shown(str(path), 200)
     try:
-        if path.stat().st_size > CSV_LIMIT:
+        with open(path, "rb") as stream:
+            raw = stream.read(CSV_LIMIT + 1)
+        if len(raw) > CSV_LIMIT:
             raise InputError(f"{name}: the file is larger than {CSV_LIMIT} bytes")
-        text = path.read_text(encoding="utf-8-sig")
+        text = raw.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
@@ -246,7 +251,7 @@ def _read_csv(path: Path) -> dict[str, Any]:
         raise InputError(f"{name}: holds no samples; must have a line of names and a line for each sample")
     header = [column.strip() for column in rows[0]]
     header = ["wavelengths_nm" if column == "wavelength_nm" else column for column in header]
-    repeated = next((column for column in header if header.count(column) > 1), None)
+    repeated = next((column for column, count in Counter(header).items() if count > 1), None)
     if repeated is not None:
         raise InputError(f"{name}: column {shown(repeated)} is there twice")
     table = {}
@@ -286,16 +291,27 @@ def _wide(table: dict[str, np.ndarray], name: str) -> dict[str, Any]:
     arrays: dict[str, Any] = {key: samples[:, i] for i, key in enumerate(keys)} | {"wavelengths_nm": nm}
     row = row.ravel()
     pairs = row * len(nm) + channel
-    twice = np.flatnonzero(np.bincount(pairs) > 1)
-    if len(twice):  # repeated measurements are samples of their own
-        repeat = np.zeros(len(pairs), int)
-        for pair in twice:
-            repeat[pairs == pair] = np.arange(np.count_nonzero(pairs == pair))
+    repeat = _repeats(pairs)
+    if repeat.any():  # repeated measurements are samples of their own
         row = np.unique(row * (repeat.max() + 1) + repeat, return_inverse=True)[1].ravel()
         first = np.unique(row, return_index=True)[1]
         arrays |= {key: table[key][first] for key in keys}
+    if len(first) * len(nm) > CELLS_LIMIT:
+        raise InputError(
+            f"{name}: has {len(first)} samples and {len(nm)} wavelengths; must be at most {CELLS_LIMIT} pairs of them"
+        )
     for column in ("radiance", "sigma", "relative_sigma", "mask"):
         if column in table:
             arrays[column] = np.full((len(first), len(nm)), 0.0 if column == "mask" else np.nan)
             arrays[column][row, channel] = table[column]
     return arrays
+
+
+def _repeats(values: np.ndarray) -> np.ndarray:
+    """How often the same value was there before, for each."""
+    order = np.argsort(values, kind="stable")
+    ordered, places = values[order], np.arange(len(values))
+    starts = np.r_[True, ordered[1:] != ordered[:-1]]
+    found = np.empty(len(values), int)
+    found[order] = places - np.maximum.accumulate(np.where(starts, places, 0))
+    return found

@@ -36,8 +36,11 @@ def register() -> None:
     May be called any number of times, before or after a variant is set.
     """
     import atmo_jit  # noqa: F401, I001  (first: it points Dr.Jit at a usable LLVM library before Mitsuba imports it)
+    import drjit as dr
     import mitsuba as mi
 
+    if dr.thread_count() == 1:  # one processor: Mitsuba's writer of OpenEXR waits for another thread, without end
+        dr.set_thread_count(2)
     mi.detail.add_variant_callback(_on_variant)
     if mi.variant() is not None:
         _on_variant(None, mi.variant())

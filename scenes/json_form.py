@@ -39,6 +39,7 @@ from atmo_jit.errors import InputError, shown
 # (path of the object, key, value) of keys that Mitsuba's dictionaries cannot hold
 Dotted = list[tuple[str, str, Any]]
 _INT64 = 2**63
+SIZE_LIMIT = 2**24  # bytes of a file
 
 
 def read(path: Path, parameters: Mapping[str, str]) -> tuple[dict[str, Any], Dotted]:
@@ -48,9 +49,11 @@ def read(path: Path, parameters: Mapping[str, str]) -> tuple[dict[str, Any], Dot
     A Mitsuba variant must be set. Raises InputError.
     """
     try:
-        content = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_duplicates
-        )
+        with open(path, "rb") as stream:
+            raw = stream.read(SIZE_LIMIT + 1)
+        if len(raw) > SIZE_LIMIT:
+            raise InputError(f"{path}: is larger than {SIZE_LIMIT} bytes")
+        content = json.loads(raw.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_duplicates)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
     except RecursionError:
@@ -58,6 +61,8 @@ def read(path: Path, parameters: Mapping[str, str]) -> tuple[dict[str, Any], Dot
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text") from None
     except ValueError as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: is not JSON: {error}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: is not a JSON object")
@@ -70,11 +75,12 @@ def _no_constant(name: str) -> NoReturn:
 
 
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = [key for key, _ in pairs]
-    for key in keys:
-        if keys.count(key) > 1:
+    seen: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in seen:
             raise ValueError(f"the key {key!r} appears twice in one object")
-    return dict(pairs)
+        seen[key] = value
+    return seen
 
 
 class _Expander:

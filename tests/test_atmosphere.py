@@ -347,6 +347,21 @@ def test_species_are_counted(earth):
     assert text == "mie: found a list of 65; allowed: null, an object, or a list of 1 to 64 objects"
 
 
+def test_altitudes_are_counted(earth):
+    """Of all profiles together: a solve with 200,000 took hours, and no signal ended it."""
+    def table(first, count):
+        return {"altitude_m": [float(first + i) for i in range(count)], "density": [1.0] * count}
+
+    rayleigh = {"scattering_per_m": 1e-5, "profile": table(0, 3000)}
+    aerosol = {key: value for key, value in earth["mie"].items() if key != "scale_height_m"}
+    fits = earth | {"rayleigh": rayleigh, "mie": aerosol | {"profile": table(1000, 4000)}}
+    assert len(Atmosphere(fits).constituents) == 3
+    text = str(refusal(fits | {"mie": [aerosol | {"profile": table(1001, 4000)}]}))
+    assert text == (
+        "mie.0.profile.altitude_m: found a list of 4000; allowed: at most 5000 altitudes in all profiles together"
+    )
+
+
 def test_hostile_text_stays_on_one_short_line(earth):
     error = refusal(changed(earth, "mie.phase.type", "a\nb\x1b[31m" * 1000))
     assert len(str(error)) < 300 and str(error).isprintable()

@@ -155,6 +155,14 @@ def test_files_that_are_no_npz(tmp_path):
     assert "is not an NPZ file (it holds 'readme.txt')" in refusal(tmp_path / "other.zip")
 
 
+@pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
+def test_what_has_no_end_is_not_read(tmp_path):
+    """zipfile looks for the end of a device in all of it, and a pipe waits for someone who writes."""
+    os.mkfifo(tmp_path / "pipe.npz")
+    for path in ("/dev/zero", tmp_path / "pipe.npz"):
+        assert refusal(path).endswith("is not a file")
+
+
 def test_damaged_files(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", x=np.random.default_rng(1).random(1000))
     whole = (tmp_path / "a.npz").read_bytes()

@@ -173,6 +173,8 @@ BROKEN = {
     "NaN": ('{"a": NaN}', "is not JSON: NaN is not a number that a scene can hold"),
     "overflow": ('{"a": 1e999}', "a is inf; must be finite"),
     "twice": ('{"a": 1, "a": 2}', "is not JSON: the key 'a' appears twice in one object"),
+    "large": (" " * 2**24 + "{}", "is larger than 16777216 bytes"),
+    "many keys": ("{" + ",".join(f'"k{i}": 1' for i in range(200_000)) + ',"k0": 1}', "the key 'k0' appears twice"),
     "list": ("[1]", "is not a JSON object"),
     "deep": ('{"a":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
     "deep but valid": ('{"type":"scene","a":' * 900 + "1" + "}" * 900, ""),

@@ -49,8 +49,9 @@ def test_rounding_past_a_limit_is_put_back_on_it():
 
 
 REFUSED = {
-    "negative altitude": (dict(altitude_m=[0, -1, 2]), "altitude_m[1] is -1.0; allowed are finite numbers >= 0"),
+    "negative altitude": (dict(altitude_m=[0, -1, 2]), "altitude_m[1] is -1.0; allowed are numbers from 0 to 1e+30"),
     "NaN altitude": (dict(altitude_m=[0, np.nan, 2]), "altitude_m[1] is nan;"),
+    "altitude beyond single precision": (dict(altitude_m=[0, 1, 1e300]), "altitude_m[2] is 1e+300;"),
     "infinite altitude": (dict(altitude_m=[0, 1, np.inf]), "altitude_m[2] is inf;"),
     "sun zenith": (dict(sun_zenith_deg=[0, 180.001, 0]), "sun_zenith_deg[1] is 180.001; allowed are numbers"),
     "negative view zenith": (dict(view_zenith_deg=[-0.5, 0, 0]), "view_zenith_deg[0] is -0.5;"),
@@ -94,7 +95,8 @@ def test_not_a_mapping():
 def test_file_round_trip_and_its_name_in_messages(tmp_path):
     path = tmp_path / "views.npz"
     np.savez(path, **good())
-    assert np.array_equal(load_views(path)["azimuth_deg"], good()["azimuth_deg"])
+    assert np.array_equal(load_views(path)["view_zenith_deg"], good()["view_zenith_deg"])
+    assert np.array_equal(load_views(path)["azimuth_deg"], [0.0, 0.0, 359.0])  # whole turns are left out
     np.savez(path, **good(altitude_m=[0, -1, 2]))
     with pytest.raises(InputError, match=r"views\.npz: altitude_m\[1\] is -1"):
         load_views(path)
@@ -105,3 +107,10 @@ def test_numbers_do_not_broadcast_in_a_file(tmp_path):
     np.savez(path, **good(altitude_m=5.0))
     with pytest.raises(InputError, match=r"altitude_m has shape \(\); must be a 1-D array"):
         load_views(path)
+
+
+def test_whole_turns_of_azimuth_are_left_out():
+    """In single precision 1e300 degrees are infinite, and the cosine of that NaN."""
+    turns = [-1e300, 1e20, -450.0, -90.0, 360.0, 3690.0]
+    found = check_views({**good(), "altitude_m": 0, "sun_zenith_deg": 0, "view_zenith_deg": 0, "azimuth_deg": turns})
+    assert found["azimuth_deg"].tolist() == [np.fmod(-1e300, 360.0), np.fmod(1e20, 360.0), -90.0, -90.0, 360.0, 90.0]

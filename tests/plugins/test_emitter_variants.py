@@ -147,6 +147,21 @@ def test_registering_again_and_switching_back(plugins) -> None:
     assert isinstance(emitter, mi.Emitter) and ".. pluginparameters::" in type(emitter).__doc__
 
 
+def test_mitsuba_writes_pictures_where_there_is_one_processor(tmp_path) -> None:
+    """Its writer of OpenEXR waits without end for a second thread of Dr.Jit's pool."""
+    code = """
+import sys
+import drjit as dr
+dr.set_thread_count(1)
+import atmo_jit.plugins
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+atmo_jit.plugins.register()
+mi.Bitmap(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, [320, 180]).write(sys.argv[1])
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.exr")], check=True, timeout=60)
+
+
 def test_register_before_any_variant_and_without_side_effects() -> None:
     # In a process of its own: what an import does not do cannot be seen in this one.
     code = """

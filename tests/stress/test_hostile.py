@@ -27,6 +27,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+CSV_NAMES = "altitude_m,sun_zenith_deg,view_zenith_deg,azimuth_deg,wavelengths_nm,radiance\n"
+
+
 def test_some_of_the_files():
     found, wrong = feed(21, seed=1)
     assert wrong == [] and sum(found.values()) == 21
@@ -103,3 +106,38 @@ def test_rows_that_are_none(row, text, tmp_path):
     (tmp_path / "scan.csv").write_text(f"altitude_m,radiance\n{row}\n0,1\n")
     with pytest.raises(InputError, match=text):
         load_observations(tmp_path / "scan.csv")
+
+
+def test_rows_without_end_of_wavelengths(tmp_path):
+    """Each row of its own sample and wavelength: 20,000 take 600 kB, and would take 3 GB as samples by wavelengths."""
+    rows = "".join(f"0,40,{i * 1e-3},90,{400 + i * 1e-3},0.05\n" for i in range(20_000))
+    (tmp_path / "scan.csv").write_text(CSV_NAMES + rows)
+    with pytest.raises(InputError, match="has 20000 samples and 20000 wavelengths; must be at most"):
+        load_observations(tmp_path / "scan.csv")
+
+
+def test_repeated_rows_are_samples_of_their_own(tmp_path):
+    """A hundred thousand of them too, within seconds."""
+    count = 100_000
+    rows = [f"0,40,{i % 50_000 * 1e-3},90,{w},{0.05 + (i + w) * 1e-6}\n" for w in (440, 550) for i in range(count)]
+    (tmp_path / "scan.csv").write_text(CSV_NAMES + "".join(rows))
+    found = load_observations(tmp_path / "scan.csv")
+    assert found.radiance.shape == (100_000, 2) and np.isfinite(found.radiance).all()
+    assert np.unique(found.radiance[:, 0]).size == 100_000
+    assert found.radiance[:, 1] - found.radiance[:, 0] == pytest.approx(1.1e-4, rel=1e-6)
+
+
+def test_thousands_of_columns(tmp_path):
+    names = ",".join(f"c{i}" for i in range(200_000))
+    (tmp_path / "scan.csv").write_text(f"{names},c0\n1\n")
+    with pytest.raises(InputError, match="column 'c0' is there twice"):
+        load_observations(tmp_path / "scan.csv")
+
+
+@pytest.mark.parametrize("scan", [np.inf, np.nan, 0.5])
+def test_scans_that_are_no_number(scan, tmp_path):
+    arrays = {"altitude_m": 0.0, "sun_zenith_deg": 40.0, "view_zenith_deg": np.zeros(1), "azimuth_deg": 0.0}
+    arrays |= {"radiance": np.full((1, 1), 0.05), "wavelengths_nm": np.array([550.0]), "scan": np.array([scan])}
+    (tmp_path / "scan.npz").write_bytes(npz(arrays))
+    with pytest.raises(InputError, match=f"scan holds {scan:g}; must be whole numbers"):
+        load_observations(tmp_path / "scan.npz")
