@@ -16,11 +16,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import evaluated, floats, packet, padded, row, stored, sum_loop, together, types, uints
+from .backend import evaluated, floats, packet, padded, row, row_size, stored, table, types, uints
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
 from .harmonics import Harmonics, pair_count, pairs, recurrence
+from .look_ups import LookUps
 from .optics import Optics
 from .paths import lagrange
 from .refinement import Reference, Taps
@@ -101,18 +102,21 @@ class Field:
         dr.eval(self._irradiances, self._guide)
 
     @cached_property
-    def _tables(self) -> tuple[Any, Any, Any, Any]:
-        """Moments at refined suns for look-ups, phase moments, and the recurrences of harmonics."""
+    def _tables(self) -> tuple[Any, Any, Any]:
+        """Moments at refined suns for look-ups, the phase moments of every pair, and the recurrence of harmonics."""
+        width = len(self.optics.scatterers) * self.optics.channel_count
 
         def steps() -> tuple[Any, Any]:
             l_, m = pairs(self.degree)
             rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
-            return floats(rows), floats(l_)
+            size = row_size(width)
+            return table(np.pad(rows, ((0, -len(rows) % 8), (0, 0)))), uints(l_[:, None] * size + np.arange(size))
 
+        recurrences, places = self.grid.kept(("recurrences", self.degree, width), steps)
         return (
             self._refined(self.moments, pair_count(self.degree)),
-            self.optics.phase_moments(self.degree),
-            *self.grid.kept(("recurrences", self.degree), steps),
+            evaluated(dr.gather(types().Float, self.optics.phase_moments(self.degree), places)),
+            recurrences,
         )
 
     @cached_property
@@ -184,36 +188,30 @@ class Field:
         nodes, weights, scales = self.corners(h, mu_s, active)
         weights = [[w * scales[i // 2][c] for c in range(channels)] for i, w in enumerate(weights)]
         sine = safe_sine(mu)
-        basis = Harmonics(dr.detach(mu), dr.detach(sine * cos_phi), slopes=dr.grad_enabled(mu, cos_phi))
-        moments, phases, recurrences, degrees = self._tables
-        # Together: one kernel makes the derivatives by all that the loop reads.
-        moments, phases, *weights = together([moments, phases, *(w for of_node in weights for w in of_node)])
-        weights = [weights[i : i + channels] for i in range(0, len(weights), channels)]
-        stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
-
-        def pair(i: Any, state: Any, sums: list[list[Any]], weights: list[list[Any]]) -> tuple[Any, ...]:
-            values, state = basis.next(packet(recurrences, i, 4, active), state)
-            corner = [packet(moments, node * stride + i, padded(channels), active, alone=True) for node in nodes]
-            moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
-            degree = t.UInt(dr.gather(t.Float, degrees, i, active))
-            chi = row(phases, degree, kinds * channels, active=active, alone=True)
-            light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
-            return i + 1, state, [
-                [dr.fma(value, part, s) for part, s in zip(light, old, strict=True)]
-                for value, old in zip(values, sums, strict=True)
-            ]
-
+        x = sine * cos_phi
+        basis = Harmonics(dr.detach(mu), dr.detach(x), slopes=dr.grad_enabled(mu, cos_phi))
+        moments, phases, recurrences = self._tables
         width = dr.width(h)
-        sums = [[dr.zeros(t.Float, width) for _ in range(kinds * channels)] for _ in range(basis.count)]
-        state = (t.UInt(0), basis.start(width), sums)
-        *_, sums = sum_loop(state, lambda i, *_: i < stride, pair, weights, "scattered")
-        total = sums[0]
-        if basis.slopes:
-            # The directions enter the loop without derivatives, which here follow from the sums of the slopes.
-            dr.eval(sums)
-            steps = mu - basis.mu, sine * cos_phi - basis.x
-            for step, slopes in zip(steps, sums[1:], strict=True):
-                total = [dr.fma(step, dr.detach(slope), value) for slope, value in zip(slopes, total, strict=True)]
+        if dr.grad_enabled(moments, phases, weights) or basis.slopes:
+            look_ups = LookUps(self.grid, self.degree, channels, kinds, nodes[0], basis, recurrences, active)
+            total, slopes = look_ups(moments, phases, weights)
+            # Directions have no derivative in there; theirs follow from the slopes.
+            for step, of_step in zip((mu - basis.mu, x - basis.x), slopes, strict=False):
+                total = [dr.fma(step, slope, value) for slope, value in zip(of_step, total, strict=True)]
+        else:
+            stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
+
+            def pair(i: Any, state: Any, sums: list[Any]) -> tuple[Any, ...]:
+                (value,), state = basis.next(packet(recurrences, i, 4, active), state)
+                corner = [packet(moments, node * stride + i, padded(channels), active) for node in nodes]
+                moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
+                chi = row(phases, i, kinds * channels, active=active)
+                light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
+                return i + 1, state, [dr.fma(value, part, s) for part, s in zip(light, sums, strict=True)]
+
+            sums = [dr.zeros(t.Float, width) for _ in range(kinds * channels)]
+            state = (t.UInt(0), basis.start(width), sums)
+            *_, total = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
         if self._steep(h, mu_s):
             total = [a + b for a, b in zip(total, self._moved(h, mu_s, basis, active), strict=True)]
         solar = self.optics.spread(width).solar
@@ -229,13 +227,12 @@ class Field:
         moved, parts = steep_nodes(self.grid, self.reference, self._guide, h, mu_s, active)
         total = [0.0] * (kinds * channels)
         with dr.suspend_grad():
-            moments, phases, recurrences, degrees = (dr.detach(v) for v in self._tables)
+            moments, phases, recurrences = (dr.detach(v) for v in self._tables)
             basis, stride = Harmonics(basis.mu, basis.x, slopes=False), dr.opaque(t.UInt, pair_count(self.degree), 1)
 
             def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
                 (value,), state = basis.next(packet(recurrences, i, 4, active), state)
-                degree = t.UInt(dr.gather(t.Float, degrees, i, active))
-                chi = row(phases, degree, kinds * channels, active=active, alone=True)
+                chi = row(phases, i, kinds * channels, active=active)
                 new, size = [], padded(channels)
                 for (nodes, weights), old in zip(parts, sums, strict=True):
                     corner = [packet(moments, node * stride + i, size, active, alone=True) for node in nodes]
