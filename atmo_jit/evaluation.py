@@ -8,8 +8,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from . import noted
 from ._trees import flat, like
 from .backend import doubles, evaluated, traversing, types
+from .batches import Batches
 from .parameters import VIEWS
 from .profile_tangents import few_numbers
 from .recording import Recordings, copied
@@ -93,11 +95,56 @@ class Evaluation:
             dr.enable_grad(wanted)
             return _pulled_back(self._sky.columns_again(values, known), weights, wanted)
 
+        def tables_of(values: Any, solved: Any) -> tuple[Any, list[Any]]:
+            """The tables of look-ups, and all that was evaluated for them."""
+            tables = [band["columns"] for band in solved]
+            sky = self._sky.again(values, [band["shares"] for band in solved], tables, [b["orders"] for b in solved])
+            with noted.noting() as notes:
+                return [band.field.tables for band in sky.solutions], list(notes)
+
+        def of_rays(values: Any, whole: Any, solved: Any, look_ups: Any, begin: Any) -> tuple[Any, ...]:
+            """Derivatives by values, columns, views, and the tables of look-ups, of the views of a batch."""
+            views, pieces, weights = batches.taken(begin, *whole)
+            values, look_ups = copied(values), copied(look_ups)
+            own, tables = leaves(values, solved)
+            wanted = own, tables if by_columns else [], {n: views[n] for n in of_views}, look_ups if of_values else []
+            dr.enable_grad(wanted)
+            dr.disable_grad([part["guide"] for part in look_ups])  # guides only
+            sky = self._sky.looked_up(values, tables, look_ups)
+            return _pulled_back(self._outputs(sky, views, pieces, tuple(weights)), flat(weights), wanted)
+
+        def of_tables(values: Any, solved: Any, notes: list[Any], look_ups: Any) -> tuple[Any, ...]:
+            """Derivatives by values, columns, and the light of order 1 and of the later ones, of the tables."""
+            values, orders = copied(values), copied([band["orders"] for band in solved])
+            own, tables = leaves(values, solved)
+            wanted = own, tables if by_columns else [], *([b[name] for b in orders] for name in ("first", "later"))
+            dr.enable_grad(wanted)
+            sky = self._sky.again(values, [band["shares"] for band in solved], tables, orders)
+            with noted.knowing(notes):
+                made = [band.field.tables for band in sky.solutions]
+            return _pulled_back(flat(made), flat(look_ups), wanted)
+
         # Several recordings: what one needs in between is free when it has been played.
         small = [{**band, "known": None, "orders": _orders_of(band["known"])} for band in solved]
-        found, tables, by_views, first, later = self._run(
-            ("reverse", *key), of_field, values, views, pieces, small, weights
-        )
+        batches = self._batches(views, pieces)
+        if batches is None:
+            found, tables, by_views, first, later = self._run(
+                ("reverse", *key), of_field, values, views, pieces, small, weights
+            )
+        else:
+            look_ups, notes = self._run("tables", tables_of, values, small)
+            bare, sums, by_views = [{"columns": band["columns"]} for band in solved], None, []
+            for begin in batches.begins():
+                whole = views, pieces, weights
+                *more, part, by_tables = self._run(("rays", *key), of_rays, values, whole, bare, look_ups, begin)
+                by_views.append(part)
+                sums = [*more, by_tables] if sums is None else _sum(sums, [*more, by_tables])
+                dr.eval(sums)
+            by_views = batches.joined(by_views)
+            if of_values:
+                found, tables, by_tables = sums
+                *more, first, later = self._run(("field", *of_values), of_tables, values, small, notes, by_tables)
+                found, tables = _sum([found, tables], more)
         if of_values:
             sums = [found, tables]
             if flat(later):
@@ -110,6 +157,10 @@ class Evaluation:
                 found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, tables))
             dr.eval(found)  # one by one each would be a kernel
         return found, by_views
+
+    def _batches(self, views: Any, pieces: Any) -> Batches | None:
+        """Batches of the views, if they are many."""
+        return Batches.of(dr.width(views["altitude_m"]), pieces)
 
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():
@@ -170,6 +221,9 @@ class TableEvaluation(Evaluation):
         super().__init__(sky, options)
         self._recorded = False
         self._place, self._view_zenith, self._azimuth = (altitude_m, sun_zenith), view_zenith, azimuth
+
+    def _batches(self, views: Any, pieces: Any) -> None:
+        return None
 
     def _outputs(
         self, sky: Sky, views: dict[str, Any], pieces: None, wanted: Collection[str] = OUTPUTS

@@ -70,6 +70,29 @@ class Field:
         parts = (held[name] for name in ("moments", "sky", "reflected"))
         return cls(optics, columns, grid, reference, degree, *parts, scatters=scatters)
 
+    @classmethod
+    def of_tables(
+        cls, optics: Optics, columns: SunColumns, grid: Grid, degree: int, tables: dict[str, Any], *, scatters: bool
+    ) -> Field:
+        """A field that has nothing but the ``tables`` of look-ups of another."""
+        reference = Reference(grid, optics.channel_count)  # its guide serves
+        field = cls(optics, columns, grid, reference, degree, *[None] * 3, scatters=scatters)
+        field.__dict__ |= {"_guide": tables["guide"], "_irradiances": tables["irradiances"]}
+        if "moments" in tables:
+            field.__dict__["_refined_moments"] = tables["moments"]
+        return field
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """Its tables of look-ups, by name."""
+        self.prepare()
+        found = {"guide": self._guide, "irradiances": list(self._irradiances)}
+        return found | ({"moments": self._refined_moments} if self._looks_up else {})
+
+    @property
+    def _looks_up(self) -> bool:
+        return bool(self.scatters and self.optics.scatterers)
+
     @property
     def held(self) -> dict[str, Any]:
         """Its numbers, by name."""
@@ -97,7 +120,7 @@ class Field:
     def prepare(self) -> None:
         """Make the tables for look-ups, which cannot be made while a kernel is traced."""
         self.grid.prepare()
-        if self.scatters and self.optics.scatterers:
+        if self._looks_up:
             dr.eval(self._tables)
         dr.eval(self._irradiances, self._guide)
 
@@ -114,10 +137,14 @@ class Field:
 
         recurrences, places = self.grid.kept(("recurrences", self.degree, width), steps)
         return (
-            self._refined(self.moments, pair_count(self.degree)),
+            self._refined_moments,
             evaluated(dr.gather(types().Float, self.optics.phase_moments(self.degree), places)),
             recurrences,
         )
+
+    @cached_property
+    def _refined_moments(self) -> Any:
+        return self._refined(self.moments, pair_count(self.degree))
 
     @cached_property
     def _guide(self) -> Any:

@@ -20,7 +20,7 @@ from .grid import Grid
 from .harmonics import Harmonics, pair_count
 
 CHUNK = 256  # look-ups that a lane sums on the way back: what it adds to memory then is little beside
-BATCH = 8192  # look-ups whose harmonics are held at once
+BATCH = 4096  # look-ups whose harmonics are held at once
 TOGETHER = 4  # pairs that a lane sums on the way back: they share what it reads of the look-ups
 CORNERS = 4
 

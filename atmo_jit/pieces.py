@@ -61,6 +61,20 @@ class Pieces:
         """How many there are, of all rays."""
         return dr.width(self.start)
 
+    def taken(self, begin: Any, rays: int, room: int) -> Pieces:
+        """Those of so many ``rays`` from number ``begin`` on, with ``room`` for as many pieces; of rays beyond the last
+        there are none."""
+        t = types()
+        first = dr.minimum(begin + dr.arange(t.UInt, rays + 1), dr.opaque(t.UInt, dr.width(self.first) - 1, 1))
+        first, base = dr.gather(t.UInt, self.first, first), dr.gather(t.UInt, self.first, begin)
+        lane = dr.arange(t.UInt, room)
+        first = evaluated(first - base)
+        place, there = base + lane, lane < dr.gather(t.UInt, first, dr.opaque(t.UInt, rays, 1))
+        start, length = (dr.gather(t.Float, values, place, there) for values in (self.start, self.length))
+        ray = dr.select(there, dr.gather(t.UInt, self.ray, place, there) - begin, 0)
+        own = dr.select(there, dr.gather(t.UInt, self.begin, place, there) - base, lane)
+        return Pieces(first, ray, own, start, length, dr.gather(t.Bool, self.closes, place, there), self.rule)
+
     @classmethod
     def of(cls, optics: Optics, rays: Rays, *, fine: bool = False) -> Pieces | None:
         """The pieces that march.march would integrate; None: no ray meets air. ``fine``: of the first FIRST_PART is a
@@ -101,7 +115,7 @@ class Pieces:
             total = int(ends[width - 1])
             if total == 0:
                 return None
-            total = _room(total)
+            total = room_for(total)
             ray, start, length = dr.zeros(t.UInt, total), dr.zeros(t.Float, total), dr.zeros(t.Float, total)
             closes, before = dr.zeros(t.UInt, total), ends - counts
             lane, begin = dr.arange(t.UInt, width), dr.arange(t.UInt, total)
@@ -247,7 +261,7 @@ def _at_its_level(optics: Optics, rays: Rays, distance: Any) -> Any:
     return dr.select(steep, -moves / dr.select(steep, rises, 1.0), 0.0)
 
 
-def _room(count: int) -> int:
+def room_for(count: int) -> int:
     """Pieces for which there is room: sizes that seldom change between atmospheres, so that recordings serve."""
     step = 1 << max(count.bit_length() - 4, 4)
     return -(-count // step) * step

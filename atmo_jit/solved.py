@@ -187,6 +187,17 @@ class Sky:
             other._bands.append(_Band(field.optics, columns, field))
         return other
 
+    def looked_up(self, values: list[dict[str, Any]], columns: list[Any], tables: list[dict[str, Any]]) -> Sky:
+        """The sky for ``values`` of the bands, with the ``tables`` of its fields alone (Field.tables), all of which may
+        carry derivatives; ``columns``: see columns_again."""
+        other, other._bands = copy(self), []
+        for band, new, table, of_field in zip(self._bands, values, columns, tables, strict=True):
+            optics, grid = band.optics.with_values(new), self.grid
+            toward_sun, degree = sun_columns(optics, grid, table), self.resolution.first_degree
+            field = Field.of_tables(optics, toward_sun, grid, degree, of_field, scatters=self.orders != 1)
+            other._bands.append(_Band(optics, toward_sun, field))
+        return other
+
     @property
     def bands(self) -> list[_Band]:
         """The solution at up to four wavelengths each, its look-up tables made: what tables are baked from."""
