@@ -13,9 +13,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, table_of, types, uints
+from .backend import floats, packet, row, row_size, stored, table_of, types, uints
 from .paths import Paths
 from .projection import add_harmonics
+
+SUNS, ROWS = 5, 2  # that a lane of by_moments takes
 
 
 def multilinear(function: Callable[..., Any], transposed: Callable[..., list[Any]], *inputs: Any) -> Any:
@@ -63,34 +65,61 @@ def by_moments(paths: Paths, grad: Any, weights: Any, nodes: int, suns: int, row
         return uints(order), uints(np.searchsorted(paths.level[order], np.arange(nodes + 1)))
 
     order, first = paths.kept(("visits at levels", nodes), at_levels)
-    lane = dr.arange(t.UInt, nodes * suns * rows)
-    size, per_level = dr.opaque(t.UInt, rows, 1), dr.opaque(t.UInt, suns, 1)
-    node = lane // size
-    l_, level = lane - node * size, node // per_level
-    sun = node - level * per_level
+    # A lane takes a part of some rows under some suns: what it reads for one of them serves the others.
+    size, whole = min(row_size(width), 8), row_size(width)
+    parts, some, few = (dr.opaque(t.UInt, n, 1) for n in (whole // size, -(-suns // SUNS), -(-rows // ROWS)))
+    per_level, per_sun = dr.opaque(t.UInt, suns, 1), dr.opaque(t.UInt, rows, 1)
+    lane = dr.arange(t.UInt, nodes * -(-suns // SUNS) * -(-rows // ROWS) * (whole // size))
+    place = lane // parts
+    part, node = lane - place * parts, place // few
+    row_, level = (place - node * few) * ROWS, node // some
+    sun = (node - level * some) * SUNS
     start, stop = (dr.gather(t.UInt, first, level + i) for i in (0, 1))
+    suns_, rows_ = [sun + i for i in range(SUNS)], [row_ + i for i in range(ROWS)]
 
-    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+    def add(i: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
         visit = dr.gather(t.UInt, order, i)
-        parts = row(grad, visit * per_level + sun, width), row(weights, visit * size + l_, width)
-        return i + 1, [dr.fma(a, b, s) for a, b, s in zip(*parts, sums, strict=True)]
+        come, held = (
+            [packet(table, (visit * count + dr.minimum(at, count - 1)) * parts + part, size) for at in places]
+            for table, count, places in ((grad, per_level, suns_), (weights, per_sun, rows_))
+        )
+        new = [(one, other) for one in come for other in held]
+        return i + 1, [
+            [dr.fma(a, b, s) for a, b, s in zip(*both, old, strict=True)] for both, old in zip(new, sums, strict=True)
+        ]
 
-    return _summed(add, start, stop, width, lane)
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(size)] for _ in range(SUNS * ROWS)]
+    _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
+    dr.eval(sums)  # each of the scatters would run the loop again
+    found = dr.zeros(t.Float, nodes * suns * rows * whole)
+    for values, (at, l_) in zip(sums, ((at, l_) for at in suns_ for l_ in rows_), strict=True):
+        index = ((level * per_level + at) * per_sun + l_) * parts + part
+        there = (at < per_level) & (l_ < per_sun)
+        dr.scatter(found, t.ArrayXf(values) if size > 1 else values[0], index, there)
+    dr.eval(found)
+    return found
 
 
 def by_weights(paths: Paths, grad: Any, moments: Any, suns: int, rows: int, width: int) -> Any:
     """The same by the weights, table [visits, l, width]: sums over suns."""
-    t = types()
-    lane = dr.arange(t.UInt, len(paths.station) * rows)
-    size, per_level = dr.opaque(t.UInt, rows, 1), dr.opaque(t.UInt, suns, 1)
+    t, together = types(), 1 + (rows % 2 == 0)
+    lane = dr.arange(t.UInt, len(paths.station) * rows // together)
+    size, per_level = dr.opaque(t.UInt, rows // together, 1), dr.opaque(t.UInt, suns, 1)
     visit = lane // size
     l_, node = lane - visit * size, dr.gather(t.UInt, paths.device.level, visit) * per_level
 
-    def add(sun: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        parts = row(grad, visit * per_level + sun, width), row(moments, (node + sun) * size + l_, width)
-        return sun + 1, [dr.fma(a, b, s) for a, b, s in zip(*parts, sums, strict=True)]
+    def add(sun: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+        come, place = row(grad, visit * per_level + sun, width), ((node + sun) * size + l_) * together
+        return sun + 1, [
+            [dr.fma(a, b, s) for a, b, s in zip(come, row(moments, place + i, width), old, strict=True)]
+            for i, old in enumerate(sums)
+        ]
 
-    return _summed(add, t.UInt(0), per_level, width, lane)
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(together)]
+    state = t.UInt(0), zero
+    _, sums = dr.while_loop(state, lambda i, _: i < per_level, add, max_iterations=-1, label="transposed")
+    fill = [t.Float(0.0)] * (row_size(width) - width)
+    return stored([v for values in sums for v in [*values, *fill]], lane, together * row_size(width))
 
 
 class Readers:

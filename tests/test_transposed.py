@@ -15,7 +15,7 @@ from .tolerances import ADJOINT
 
 RESOLUTION = Resolution()
 ORDERS, CHANNELS, DEGREE, AZIMUTHS = 3, 3, 4, 6
-ROWS, WIDTH = DEGREE + 2, 16  # rows of ORDERS x CHANNELS floats load in packets of 8
+WIDTH = 16  # rows of ORDERS x CHANNELS floats load in packets of 8
 
 
 @pytest.fixture(scope="module")
@@ -48,17 +48,19 @@ def filled(rng, *shape):
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_moments_seen_along_paths(samples, number):
-    """By the moments and by the weights of their sum."""
-    paths, suns = samples.paths, 27
+@pytest.mark.parametrize("suns", [27, 4])
+@pytest.mark.parametrize("degree", [DEGREE, DEGREE + 1])
+def test_moments_seen_along_paths(samples, number, suns, degree):
+    """By the moments and by the weights of their sum; numbers of suns and rows that lanes share out evenly or not."""
+    paths = samples.paths
     rng = np.random.default_rng(1)
     levels = int(paths.level.max()) + 1
-    inputs = [filled(rng, levels, suns, ROWS), filled(rng, len(paths.station), ROWS)]
+    inputs = [filled(rng, levels, suns, degree + 2), filled(rng, len(paths.station), degree + 2)]
 
     def seen(leaf):
         given = [floats(v) for v in inputs]
         given[number] = leaf
-        return contracted(paths, *given, suns, DEGREE, ORDERS, CHANNELS)
+        return contracted(paths, *given, suns, degree, ORDERS, CHANNELS)
 
     forwards, backwards, size = both_ways(seen, inputs[number], 2)
     assert forwards == pytest.approx(backwards, abs=ADJOINT * size)
