@@ -51,6 +51,8 @@ class _OneParameter:
             return
         several = isinstance(self.g, (list, tuple)) or (isinstance(self.g, np.ndarray) and self.g.ndim == 1)
         g = numbers(self.g, "g", ASYMMETRY) if several else number(self.g, "g", ASYMMETRY)
+        if np.any(np.abs(np.float32(g)) == 1.0):
+            raise AtmosphereError("g", shown(self.g), "a finite number in (-1, 1), in single precision too")
         if several:
             g.flags.writeable = False
         object.__setattr__(self, "g", g)

@@ -23,6 +23,7 @@ from ._fields import LENGTH, Range, mapping, number, numbers, one_of
 from .errors import AtmosphereError, within
 
 ALTITUDE = Range(0, LENGTH.high)
+LOWEST_M = 1e-9  # above 0: slopes of a density between 0 and 1e-300 m are infinite
 # Relative, or molecules per cubic metre beside cross sections.
 DENSITY = Range(0, 1e30)
 
@@ -92,6 +93,8 @@ class Tabulated:
         if len(altitude) != len(values):
             allowed = f"as many numbers as altitude_m has ({len(altitude)})"
             raise AtmosphereError("density", f"a list of {len(values)}", allowed)
+        for i in np.flatnonzero((altitude > 0.0) & (altitude < LOWEST_M)):
+            raise AtmosphereError(f"altitude_m[{i}]", f"{altitude[i]:g}", f"0 or a number from {LOWEST_M:g} on")
         for i in range(1, len(altitude)):
             thrice = i > 1 and altitude[i] == altitude[i - 2]
             if altitude[i] < altitude[i - 1] or thrice:

@@ -33,6 +33,7 @@ STALLED = 10  # turns in which a correction has to halve: what does not is round
 # Parts of the light that are taken to be absorbed: air so thick that less than that escapes is white in name only,
 # rounding decides what becomes of its light.
 ABSORBED = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
+WILD = 1.1  # times the brightest light of the guide, which it is near: the iteration has grown instead of ending
 
 
 class Remainder:
@@ -250,61 +251,82 @@ def found(
 
     ``run``: runs a function of arrays under a key, recorded where it can be.
     """
+    with noted.apart():
+        upright = _upright(gather, project)
+        taken = np.zeros(len(upright), int)
+        while True:
+            held, rest, grown = _iterated(gather, project, light, tolerance, run, *_inverted(project, upright, taken))
+            wild = ~(grown < WILD) & (taken + 1 < len(ABSORBED))
+            if not wild.any():
+                return held, rest
+            taken += wild
+
+
+def _iterated(
+    gather: Gather,
+    project: Projection,
+    light: Any,
+    tolerance: float,
+    run: Callable[..., Any],
+    inverse: np.ndarray,
+    kept: np.ndarray,
+    upright: np.ndarray,
+) -> tuple[dict[str, Any], Any, np.ndarray]:
+    """The same with the matrices of _inverted, and the brightest light over that of the guide [channels]."""
     grid, channels = gather.grid, gather.optics.channel_count
     altitudes, suns = grid.shape
-    with noted.apart():
-        inverse, kept, upright = _inverted(gather, project)
-        last = Moments(light, project.degree, project.most, suns, channels)
-        rows = [*range(project.degree + 1), last.entries - 1]
-        whole = last.numpy()[:, rows].astype(float)
-        # The guide needs not be exact: without the turn of paths it nearly is.
-        flat = np.moveaxis(whole, -1, 0).reshape(channels, altitudes * len(rows), -1)
-        total = flat + inverse @ (upright @ flat)
-        zeroth = np.moveaxis(total.reshape(channels, altitudes, len(rows), -1)[:, :, 0, :suns], 0, -1)
-        held = {
-            **_Guide.tables(zeroth),
-            "matrix": floats(inverse),
-            "kept": floats(kept),
-            "turns": [],
-        }
-        equation = Remainder(gather, project, held)
-        over = held["inverse"].numpy().reshape(altitudes, suns, -1)[..., :channels]
+    last = Moments(light, project.degree, project.most, suns, channels)
+    rows = [*range(project.degree + 1), last.entries - 1]
+    whole = last.numpy()[:, rows].astype(float)
+    # The guide needs not be exact: without the turn of paths it nearly is.
+    flat = np.moveaxis(whole, -1, 0).reshape(channels, altitudes * len(rows), -1)
+    total = flat + inverse @ (upright @ flat)
+    zeroth = np.moveaxis(total.reshape(channels, altitudes, len(rows), -1)[:, :, 0, :suns], 0, -1)
+    held = {
+        **_Guide.tables(zeroth),
+        "matrix": floats(inverse),
+        "kept": floats(kept),
+        "turns": [],
+    }
+    equation = Remainder(gather, project, held)
+    over = held["inverse"].numpy().reshape(altitudes, suns, -1)[..., :channels]
 
-        def size(values: Any) -> np.ndarray:
-            """Largest zeroth moment [S, channels], over the guide."""
-            return np.abs(equation.moments(values).numpy()[:, 0, :suns] * over).max(axis=0)
+    def size(values: Any) -> np.ndarray:
+        """Largest zeroth moment [S, channels], over the guide."""
+        return np.abs(equation.moments(values).numpy()[:, 0, :suns] * over).max(axis=0)
 
-        def turn(own: Any, made: Any, *arguments: Any) -> tuple[Any, Any]:
-            return Remainder(gather, project, own, made).turn(*arguments)
+    def turn(own: Any, made: Any, *arguments: Any) -> tuple[Any, Any]:
+        return Remainder(gather, project, own, made).turn(*arguments)
 
-        def power(own: Any, made: Any, light: Any) -> Any:
-            of = Remainder(gather, project, own, made)
-            return evaluated(light - of.preconditioned(evaluated(light - of.step(light))))
+    def power(own: Any, made: Any, light: Any) -> Any:
+        of = Remainder(gather, project, own, made)
+        return evaluated(light - of.preconditioned(evaluated(light - of.step(light))))
 
-        right = evaluated(equation.step(light))
-        other, sizes = equation.preconditioned(right), []
-        for _ in range(POWERS):
-            sizes.append(float(size(other).max()))
-            if sizes[-1] == 0.0:
-                break
-            other = evaluated(other / sizes[-1])
-            other = run("power", power, held, equation.made, other)
-        spread = max(SPREAD, 1.2 * float(np.mean(sizes[POWERS // 2 :])) if sizes[-1] else 0.0)
-        light = correction = None
-        errors: list[float] = []
-        for momentum, share in _coefficients(NEAREST, 1.0 + spread):
-            coefficients = [floats([momentum]), floats([share])]
-            held["turns"].append(coefficients)
-            own = {**held, "turns": []}
-            light, correction = run(
-                ("turn", light is None), turn, own, equation.made, right, light, correction, *coefficients
-            )
-            change, there = size(correction), size(light)
-            errors.append(float(np.divide(change, there, out=np.zeros_like(change), where=there > 0.0).max()))
-            stalled = len(errors) > STALLED and errors[-1] > 0.5 * errors[-1 - STALLED]
-            if errors[-1] < tolerance or stalled or len(errors) == MOST_TURNS:
-                break
-    return held, light
+    right = evaluated(equation.step(light))
+    other, sizes = equation.preconditioned(right), []
+    for _ in range(POWERS):
+        sizes.append(float(size(other).max()))
+        if sizes[-1] == 0.0:
+            break
+        other = evaluated(other / sizes[-1])
+        other = run("power", power, held, equation.made, other)
+    spread = max(SPREAD, 1.2 * float(np.mean(sizes[POWERS // 2 :])) if sizes[-1] else 0.0)
+    light = correction = None
+    errors: list[float] = []
+    for momentum, share in _coefficients(NEAREST, 1.0 + spread):
+        coefficients = [floats([momentum]), floats([share])]
+        held["turns"].append(coefficients)
+        own = {**held, "turns": []}
+        light, correction = run(
+            ("turn", light is None), turn, own, equation.made, right, light, correction, *coefficients
+        )
+        change, there = size(correction), size(light)
+        errors.append(float(np.divide(change, there, out=np.zeros_like(change), where=there > 0.0).max()))
+        stalled = len(errors) > STALLED and errors[-1] > 0.5 * errors[-1 - STALLED]
+        if errors[-1] < tolerance or stalled or len(errors) == MOST_TURNS:
+            break
+    brightest = np.abs(equation.moments(light).numpy()[:, 0, :suns]).max(axis=(0, 1))
+    return held, light, brightest / np.maximum(zeroth.max(axis=(0, 1)), 1e-30)
 
 
 def _coefficients(lowest: float, highest: float) -> Iterator[tuple[float, float]]:
@@ -318,16 +340,19 @@ def _coefficients(lowest: float, highest: float) -> Iterator[tuple[float, float]
         ratio = new
 
 
-def _inverted(gather: Gather, project: Projection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """M [channels, n, n], what is not taken to be absorbed [channels], and K_0 less that [channels, n, n]; n counts
-    altitudes and within them degrees and the irradiance."""
-    upright = _upright(gather, project)
+def _inverted(
+    project: Projection, upright: np.ndarray, taken: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """M [channels, n, n], what is not taken to be absorbed [channels], and K_0 (``upright``) less that; n counts
+    altitudes and within them degrees and the irradiance. ``taken`` [channels]: the first of ABSORBED that may be taken,
+    and afterwards the one that was.
+    """
     channels, size, _ = upright.shape
     inverse, kept = np.empty_like(upright), np.ones(channels)
     zeroth = np.arange(0, size, project.degree + 2)
     for c in range(channels):
-        for absorbed in ABSORBED:
-            kept[c] = 1.0 - absorbed
+        for i in range(taken[c], len(ABSORBED)):
+            taken[c], kept[c] = i, 1.0 - ABSORBED[i]
             inverse[c] = np.linalg.inv(np.eye(size) - kept[c] * upright[c])
             # Light makes light: where not, an eigenvalue of K_0 is beyond 1.
             if inverse[c][np.ix_(zeroth, zeroth)].sum(axis=1).min() > 0.0:

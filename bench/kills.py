@@ -47,7 +47,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
 # What can be resumed is kept at every step.
 LIMITED = """
 import resource, signal, sys
-signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python starts, an interrupt just ends it
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python imports, an interrupt just ends it
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 if (limit := int(sys.argv[1])) >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 from atmo_jit import partial
@@ -73,7 +74,12 @@ class Work:
         """The running command; ``limit``: bytes that a file may have."""
         more = ["--resume"] if self.kept else []
         command = [sys.executable, "-c", LIMITED, str(-1 if limit is None else limit), *self.arguments, *more]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        # An interrupt waits until Python itself has started, which has a traceback for it.
+        former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
     def lay_old(self) -> None:
         """Old outputs in the place of the new ones."""

@@ -341,6 +341,22 @@ def test_radii_have_an_end(earth, name):
     assert str(refusal(changed(earth, name, 1e308))) == f"{name}: found 1e+308; allowed: a finite number in (0, 1e+10]"
 
 
+def test_peaks_that_single_precision_cannot_tell_from_a_line(earth):
+    """Their value straight on is 0 / 0 there."""
+    phase = {"type": "cornette_shanks", "g": 1.0 - 1e-6}
+    assert Atmosphere(changed(earth, "mie.phase", phase)).mie[0].phase.g == 1.0 - 1e-6
+    for g in (1.0 - 1e-9, [0.5, 0.5, -1.0 + 1e-16]):
+        text = str(refusal(changed(earth, "mie.phase", phase | {"g": g})))
+        assert text.startswith("mie.phase.g: found ") and "in single precision too" in text
+
+
+def test_altitudes_are_0_or_more_than_nothing(earth):
+    """The slope of a density between them would be infinite."""
+    profile = {"altitude_m": [0.0, 1e-300, 2000.0], "density": [1.0, 0.0, 1.0]}
+    text = str(refusal(changed(earth, "rayleigh", {"scattering_per_m": 1e-5, "profile": profile})))
+    assert text == "rayleigh.profile.altitude_m[1]: found 1e-300; allowed: 0 or a number from 1e-09 on"
+
+
 def test_species_are_counted(earth):
     assert len(Atmosphere(changed(earth, "mie", [earth["mie"]] * 64)).mie) == 64
     text = str(refusal(changed(earth, "mie", [earth["mie"]] * 65)))

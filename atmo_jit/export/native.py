@@ -85,5 +85,5 @@ def read(folder: Path, parameters: dict[str, Any]) -> Sky:
             suns=suns,
             held=[held[i] for i in sorted(held)],
         )
-    except (KeyError, ValueError) as error:
+    except (KeyError, IndexError, ValueError) as error:
         raise InputError(f"{str(folder / FILE)!r}: does not fit its params.json ({error})") from None

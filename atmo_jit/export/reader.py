@@ -28,7 +28,7 @@ def read(folder: str | Path) -> Any:
         return import_module(f".{layout}", __package__).read(folder, parameters)
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{str(folder / 'params.json')!r}: lacks or misstates {error}") from None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -39,4 +41,15 @@ def test_orders_and_tolerance_come_along(tmp_path):
     assert (loaded.orders, loaded.tolerance) == (1, 0.03)
     np.savez(tmp_path / FILE, **{"0.moments": np.zeros(3, np.float32)})
     with pytest.raises(InputError, match="does not fit"):
+        read(tmp_path)
+
+
+def test_a_table_of_columns_with_no_size(tmp_path):
+    """77:1304 of bench.hostile: an IndexError."""
+    export("earth", "native", tmp_path, Options(orders=1, tolerance=0.03))
+    page = tmp_path / "params.json"
+    parameters = json.loads(page.read_text(encoding="utf-8"))
+    parameters["resolution"]["columns"] = []
+    page.write_text(json.dumps(parameters), encoding="utf-8")
+    with pytest.raises(InputError, match="does not fit its params.json"):
         read(tmp_path)

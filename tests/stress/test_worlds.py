@@ -151,3 +151,15 @@ def test_sunlight_that_grazes_a_step_of_density(number, altitude, sun, view, off
     nu = np.cos(zenith - toward)
     want = Twin(air, tolerance=1e-6).single_scattering(h, np.cos(toward), np.cos(zenith), nu)[0]
     assert np.ravel(found) == pytest.approx(want, rel=off)
+
+
+@pytest.mark.parametrize("depth", [2400.0, 8000.0, 40_000.0])
+def test_air_that_is_white_in_name_only(depth):
+    """Of the Earth's wavelengths at least one took no end of the iteration for its light: 1e9 times the sun's, NaN."""
+    air = atmo_jit.presets.read("earth")
+    air["rayleigh"]["scattering_per_m"] = depth / 8000.0
+    views = {"altitude_m": [0.0, 10.0, 1e3, 1e4, 3e4, 1e5], "view_zenith_deg": [0.0, 45.0, 80.0, 120.0, 100.0, 170.0]}
+    found = atmo_jit.sky(air, {**views, "sun_zenith_deg": 40.0, "azimuth_deg": 90.0})
+    for light in (found.radiance, found.sky_irradiance):
+        assert np.isfinite(light).all() and light.min() >= 0.0
+        assert np.all(light < air["solar_irradiance"])
