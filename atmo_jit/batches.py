@@ -52,7 +52,3 @@ class Batches:
         made = views, parts, weights
         dr.eval(made)
         return made
-
-    def joined(self, parts: list[dict[str, Any]]) -> dict[str, Any]:
-        """Numbers of all views by name, given those of every batch."""
-        return {name: np.concatenate([part[name].numpy() for part in parts])[: self.rays] for name in parts[0]}

@@ -172,7 +172,8 @@ class Linearization:
             adjoints = evaluation.reverse(self._made, *arguments, columns, of_values, of_views)
         # While the kernels run.
         steps = {name: self._steps(name) for name in names if name not in RADII and name not in VIEWS}
-        found = {name: np.array(adjoints[1][name]) for name in of_views}
+        by_views = {name: [part.numpy() for part in adjoints[1][name]] for name in of_views}
+        found = {name: np.concatenate(parts)[: self.rays] for name, parts in by_views.items()}
         host = [_leaves(*both) for both in zip(self._numbers, adjoints[0], strict=False)]
         for name in names:
             if name in RADII:

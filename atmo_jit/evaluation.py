@@ -46,9 +46,10 @@ class Evaluation:
         *_, values, views = arguments
         return self._run(("forward", values and tuple(values[0]), views is None), self._forward, *arguments)
 
-    def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    def reverse(self, *arguments: Any) -> tuple[list[dict[str, Any]], dict[str, list[Any]]]:
         """Derivatives of the sum of weighted outputs, by the values and views named in the last two arguments; before
-        them the weights, W Floats [N] by output."""
+        them the weights, W Floats [N] by output. Those by views come in parts, one after the other, and may end with
+        some that are of no view."""
         values, views, pieces, solved, weights, of_values, of_views = arguments
         key = (tuple(weights), *of_values, *of_views)
         # Look-ups of columns carry the derivatives by few numbers of profiles, their table those by many.
@@ -131,6 +132,7 @@ class Evaluation:
             found, tables, by_views, first, later = self._run(
                 ("reverse", *key), of_field, values, views, pieces, small, weights
             )
+            by_views = [by_views]
         else:
             look_ups, notes = self._run("tables", tables_of, values, small)
             bare, sums, by_views = [{"columns": band["columns"]} for band in solved], None, []
@@ -140,7 +142,6 @@ class Evaluation:
                 by_views.append(part)
                 sums = [*more, by_tables] if sums is None else _sum(sums, [*more, by_tables])
                 dr.eval(sums)
-            by_views = batches.joined(by_views)
             if of_values:
                 found, tables, by_tables = sums
                 *more, first, later = self._run(("field", *of_values), of_tables, values, small, notes, by_tables)
@@ -156,7 +157,7 @@ class Evaluation:
                 known = [band["columns"] for band in solved]
                 found = _sum(found, self._run(("columns", *of_values), of_columns, values, known, tables))
             dr.eval(found)  # one by one each would be a kernel
-        return found, by_views
+        return found, {name: [part[name] for part in by_views] for name in of_views}
 
     def _batches(self, views: Any, pieces: Any) -> Batches | None:
         """Batches of the views, if they are many."""

@@ -183,9 +183,9 @@ class LookUps:
         basis, length = self._directions(look_up, slopes=False), dr.opaque(t.UInt, room // TOGETHER, 1)
 
         def some_pairs(i: Any, state: Any) -> tuple[Any, Any]:
-            values = []
-            for j in range(TOGETHER):
-                (value,), state = basis.next(packet(self.steps, i * TOGETHER + j, 4), state)
+            values, steps = [], row(self.steps, i, 4 * TOGETHER)
+            for j in range(0, 4 * TOGETHER, 4):
+                (value,), state = basis.next(steps[j : j + 4], state)
                 values.append(value)
             dr.scatter(held[0], t.ArrayXf(values), lane * length + i)
             return i + 1, state
