@@ -32,7 +32,7 @@ from .hidden_rays import LEAST_RANGE, STEPS, HiddenRays, directions, trace
 from .lattice import Lattice
 from .open_sky import OpenSky
 
-SETS, ABOUT_SUN, AROUND = 16, 96, 160  # sets of directions, which nodes take in turn; about the sun, and all around
+SETS, ABOUT_SUN, AROUND = 32, 96, 160  # sets of directions, which nodes take in turn; about the sun, and all around
 EXACT = 1e-4  # of the largest value of a phase function: it has no more moments than those that bring it so near
 PASSES = 3  # over all nodes, where orders have no limit
 OPEN = 0.02  # of the upper half of its directions, that a node in the air sees the sky in

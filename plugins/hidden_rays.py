@@ -144,10 +144,11 @@ def directions(sun: np.ndarray, g: float, sets: int, about_sun: int, around: int
     x = axis / np.linalg.norm(axis)
     frame = np.stack([x, np.cross(sun, x), sun])
     found = []
-    for _ in range(sets):
+    for s in range(sets):
         parts = []
+        start = [(s * step) % 1.0 for step in STEPS]  # all sets together are even as well
         for n, peaked in ((about_sun, True), (around, False)):
-            u, phi = fibonacci(n, *rng.random(2))
+            u, phi = fibonacci(n, *start)
             u = np.array(henyey_greenstein_cosine(mi.Float(g), mi.Float(floats(u)))) if peaked else 1.0 - 2.0 * u
             sine = np.sqrt(np.maximum(1.0 - u * u, 0.0))
             parts.append(np.stack([sine * np.cos(phi), sine * np.sin(phi), u], axis=-1))

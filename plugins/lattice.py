@@ -16,8 +16,10 @@ from .globe import Globe
 NODES = (34, 34, 14)  # along two level axes and up, at most
 MOST_NUMBERS = 5e7  # by node, direction and wavelength: more wavelengths have fewer nodes
 BINS = 512  # of the density of nodes along an axis
-EVEN = 0.2  # of the nodes along a level axis that are spread evenly; the others stand near relief
-NEAR = 0.2  # of the height of all shapes: so near relief nodes are as dense as at it, and fewer with the distance
+EVEN = 0.1  # of the nodes along a level axis that are spread evenly; the others stand near relief
+NEAR = 0.2  # of the height of all shapes: so near relief nodes are as dense as at it
+FALL = 1.5  # power of the distance to relief that the density falls with
+FLAT = 0.01  # sine of a slope, up to which the extent of a shape does not count: that of a floor
 PROBES = 1 << 16  # rays that look for shapes
 AROUND = 2.0  # of the size of all shapes, the air beside them
 FREE_PATHS = 3.0  # of light in the densest air: neither it nor their shadow matters farther off
@@ -45,7 +47,9 @@ class Lattice:
         self.found = len(relief) > 0
         if not self.found:
             return
-        low, high = places.min(axis=0), places.max(axis=0)
+        steep = relief > FLAT
+        steep = places[steep] if steep.any() else places
+        low, high = steep.min(axis=0), steep.max(axis=0)
         low[2], high[2] = max(low[2], 0.0), max(high[2], 0.0)
         # The air beside and above them changes as well, the more so in their shadow.
         tall, wide = float(high[2] - low[2]), float(np.max(high - low))
@@ -62,7 +66,7 @@ class Lattice:
         for axis in range(2):
             share, _ = np.histogram(places[:, axis], BINS, (low[axis], high[axis]), weights=relief)
             gap = np.abs(middle[:, None] - middle) * self._size[axis]
-            share = (1.0 / (NEAR * tall + gap)) @ share  # gaps between nodes grow as the distance to shapes does
+            share = (1.0 / (NEAR * tall + gap)) ** FALL @ share
             total = share.sum()
             share = np.full(BINS, 1.0) if total <= 0.0 else EVEN / BINS + (1.0 - EVEN) * share / total
             warps.append(np.concatenate([[0.0], np.cumsum(share)]) / share.sum())
@@ -105,7 +109,7 @@ class Lattice:
         """Points about nodes, at most half the way to the next, with nothing between."""
         p = mi.Point3f(*row(self._nodes, node, 3, 6))
         gaps = row(self._nodes, node, 6)[3:]
-        steps = [gap * (sampler.next_1d() - 0.5) * self._globe.scale for gap in gaps]
+        steps = [gap * (sampler.next_1d() + sampler.next_1d() - 1.0) * self._globe.scale for gap in gaps]
         axes = (*self._axes, self._globe.up)
         offset = sum(mi.Vector3f(*(float(v) for v in axis)) * step for axis, step in zip(axes, steps, strict=True))
         length = dr.norm(offset)

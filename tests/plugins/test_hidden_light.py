@@ -15,16 +15,16 @@ THICK = {**HAZE, "mie": {**HAZE["mie"], "scattering_per_m": [3e-4]}}
 
 
 @pytest.mark.parametrize(
-    ("orders", "grey", "air", "sun"),
+    ("orders", "grey", "air", "sun", "share"),
     [
-        (2, 0.0, DUST, LOW_SUN),
-        pytest.param(3, 0.0, DUST, LOW_SUN, marks=pytest.mark.slow),
-        pytest.param(None, 0.4, DUST, LOW_SUN, marks=pytest.mark.slow),
-        pytest.param(None, 0.2, THICK, SUN, marks=pytest.mark.slow),
+        (2, 0.0, DUST, LOW_SUN, 1 / 16),
+        pytest.param(3, 0.0, DUST, LOW_SUN, 1 / 16, marks=pytest.mark.slow),
+        pytest.param(None, 0.4, DUST, LOW_SUN, 1 / 16, marks=pytest.mark.slow),
+        pytest.param(None, 0.2, THICK, SUN, 1 / 8, marks=pytest.mark.slow),
     ],
     ids=["two", "three", "all", "haze"],
 )
-def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders, grey, air, sun):
+def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders, grey, air, sun, share):
     """Dust in which a low sun's beam is spent: nearly all light is of order 2 and more, and the towers hide where it
     comes from also where they cast no shadow. In thick haze their shadow is many free paths long."""
     mi.set_variant("llvm_ad_mono")
@@ -33,8 +33,9 @@ def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders,
     own, truth = (of_passes(tiles(passes(scene, 16, n), 8)) for scene, n in zip(scenes, samples, strict=True))
     free = shaded("atmosphere_path", orders, grey, air=air, sun=sun, shaft_samples=0)
     without = tiles(passes(free, 1, 8), 8)[0]
-    # Within 3 %, and a twelfth of what shapes take: at the edge of their shadow it changes from node to node.
-    allowed = 0.03 * truth.mean + np.maximum(without - truth.mean, 0.0) / 12.0
+    # Within 3 %, and a share of what shapes take: rays from nodes are few, and at the edge of a sharp shadow, as in
+    # haze, light changes from node to node.
+    allowed = 0.03 * truth.mean + share * np.maximum(without - truth.mean, 0.0)
     assert np.all(np.abs(own.mean - truth.mean) < allowed + 3.0 * np.sqrt(own.variance + truth.variance))
     # Shapes take light away, in some places most of it, and what is known of it is known well.
     assert np.max(without / truth.mean) > 2.0
