@@ -83,8 +83,8 @@ class AtmospherePath(FollowedPictures):
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
     points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders
-    that shapes keep from the air, less what their surfaces add, is a table that is made once, with 4.7 million rays
-    from 37 thousand points among, above and beside the shapes; it is made again when air or shapes change. Pictures
+    that shapes keep from the air, less what their surfaces add, is a table that is made once, with 4.1 million rays
+    from 16 thousand points among, above and beside the shapes; it is made again when air or shapes change. Pictures
     have no noise from it, but a bias close to shapes that hide most of the light (docs/method.md, docs/gallery.md).
     Two things in it are simplified: surfaces count as diffuse, and of the sky they see what their slope leaves of it,
     whatever else is in the way.
