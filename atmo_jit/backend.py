@@ -6,6 +6,7 @@ The solver has array types of its own, whatever Mitsuba variant is active: ``drj
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -53,31 +54,37 @@ def _module(name: str) -> ModuleType:
 
 def floats(values: Any) -> Any:
     """A Dr.Jit ``Float`` buffer with the values of an array, flattened in C order."""
-    return types().Float(_aligned(values, np.float32))
+    return types().Float(_copied(values, np.float32))
 
 
 def doubles(values: Any) -> Any:
     """A Dr.Jit ``Float64`` buffer with the values of an array, flattened in C order."""
-    return types().Float64(_aligned(values, np.float64))
+    return types().Float64(_copied(values, np.float64))
 
 
 def uints(values: Any) -> Any:
     """A Dr.Jit ``UInt`` buffer with the values of an array, flattened in C order."""
-    return types().UInt(_aligned(values, np.uint32))
+    return types().UInt(_copied(values, np.uint32))
 
 
-def _aligned(values: Any, dtype: Any) -> np.ndarray:
+def _copied(values: Any, dtype: Any) -> np.ndarray:
     """A flat copy that starts on a 64-byte boundary.
 
     Dr.Jit uses NumPy's memory as it is and compiles its alignment into the kernel: arrays that happen to lie
     elsewhere would compile the same kernel again.
     """
     flat = np.asarray(values, dtype=dtype).ravel()
-    room = np.empty(flat.nbytes + 64, dtype=np.uint8)
-    skip = -room.ctypes.data % 64
-    copy = room[skip : skip + flat.nbytes].view(dtype)
+    copy = aligned(flat.shape, dtype)
     copy[:] = flat
     return copy
+
+
+def aligned(shape: Sequence[int], dtype: Any = np.float32) -> np.ndarray:
+    """An array with any values, that starts on a 64-byte boundary."""
+    count = math.prod(shape) * np.dtype(dtype).itemsize
+    room = np.empty(count + 64, dtype=np.uint8)
+    skip = -room.ctypes.data % 64
+    return room[skip : skip + count].view(dtype).reshape(shape)
 
 
 def parameter(value: Any) -> Any:

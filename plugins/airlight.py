@@ -194,11 +194,19 @@ class Airlight:
         """Column densities (m) of all constituents up to ``end``, given those up to ``start``."""
         optics = self.bands[0].optics
         length = (end - start) * (1.0 / parts)
-        for i in range(parts):
+
+        def part(i: Any, amounts: list[Any]) -> tuple[Any, list[Any]]:
             for x, w in zip(*QUADRATURE, strict=True):
-                h, _ = altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, float(x) + i, start))
+                h, _ = altitude_along(optics.radius, rays.h, rays.mu, dr.fma(length, i + float(x), start))
                 amounts = [dr.fma(length * float(w), v, a) for v, a in zip(optics.densities(h), amounts, strict=True)]
-        return amounts
+            return i + 1.0, amounts
+
+        if parts == 1:
+            return part(0.0, amounts)[1]
+        zero = dr.zeros(mi.Float, dr.width(length))
+        state = zero + 0.0, [zero + amount for amount in amounts]
+        # A loop: written out, these nodes were a good part of what a picture's kernel compiles.
+        return dr.while_loop(state, lambda i, _: i < float(parts), part, label="columns")[1]
 
 
 def asymmetry(band: Any) -> Any:

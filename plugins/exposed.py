@@ -8,11 +8,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from atmo_jit.backend import floats
+
 
 def array(value: Any) -> Any:
     """Numbers as a ``mi.Float`` array; in scalar variants, whose Float is a Python number, as a Dr.Jit scalar array."""
     kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf
     return kind([float(v) for v in np.atleast_1d(np.asarray(value, dtype=np.float64))])
+
+
+def tensor(values: Any) -> Any:
+    """A NumPy array as a TensorXf, whose place in memory kernels do not depend on."""
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    return mi.TensorXf(mi.Float(floats(values)), values.shape) if dr.is_jit_v(mi.Float) else mi.TensorXf(values)
 
 
 def host(value: Any) -> np.ndarray:

@@ -15,212 +15,140 @@ that each pass over all nodes adds an order.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from atmo_jit.backend import floats, row, row_size, table, uints
-from atmo_jit.geometry import UPRIGHT
-from atmo_jit.march import point_along, rays_to_boundary, relative_azimuth, visible_sun
-from atmo_jit.phase import HenyeyGreenstein
-from atmo_jit.spectrum import SpectralBasis
+from atmo_jit.backend import aligned, floats, row, table, table_of, types, uints
+from atmo_jit.march import point_along
 
+from . import unfolded
 from .airlight import LEAST_EXTINCTION, STEP, Airlight, Stretch
-from .channels import Channels
-from .cornette_shanks import henyey_greenstein_cosine
-from .lattice import Lattice, fibonacci, unfolded_directions, unfolded_node
+from .hidden_rays import LEAST_RANGE, STEPS, HiddenRays, directions, trace
+from .lattice import Lattice
 from .open_sky import OpenSky
 
-SETS, ABOUT_SUN, AROUND = 64, 48, 80  # sets of directions, which nodes take in turn; about the sun, and all around
+SETS, ABOUT_SUN, AROUND = 32, 96, 160  # sets of directions, which nodes take in turn; about the sun, and all around
+EXACT = 1e-4  # of the largest value of a phase function: it has no more moments than those that bring it so near
 PASSES = 3  # over all nodes, where orders have no limit
 OPEN = 0.02  # of the upper half of its directions, that a node in the air sees the sky in
-LEAST_RANGE = 1e-3  # of rate x length of a bounded path, where single precision resolves 1 - exp(-x)
-SHORTEST = 1e-3  # m: of paths on which a point is drawn
 POINTS = 4  # of each segment, at most, at which the table is read
 FULL_DEPTH = 0.25  # optical depth from which a segment gets all of its points
-FIRST_PARTS, PARTS = 4, 2  # of the quadrature of columns
+FIRST_PARTS = 4  # of the quadrature of columns
+
+
+@dataclass
+class Phases:
+    """Phase functions times weights of directions, such that the sum over directions is 1: matrices by which light
+    from the directions of a set becomes that which goes on in those of :mod:`.unfolded`.
+
+    ``moments``: of each scatterer, [sets, directions, 9] those of degree 2 at most, where they are all that its phase
+    function has, and light is multiplied by them first; ``rows``: [sets, numbers of all scatterers, COUNT]."""
+
+    moments: list[np.ndarray | None]
+    rows: np.ndarray
 
 
 class HiddenLight:
     """What shapes take (W, less what they add) from the radiance that the air around them scatters once more, per unit
     of its scattering coefficient: by node of the ``lattice`` and direction in which the light goes on.
 
-    ``open_sky``: of the same air; ``sun``: unit vector towards it; ``most``: scatterings in it (None: no limit)."""
+    ``open_sky``: of the same air; ``most``: scatterings in it (None: no limit).
+
+    Nodes with the same set of directions lie together in the table: their rows are one product of matrices."""
 
     def __init__(self, scene: Any, air: Airlight, lattice: Lattice, open_sky: OpenSky, most: int | None) -> None:
-        self._air, self._lattice, self._open_sky = air, lattice, open_sky
-        count = lattice.count
-        self._directions, weights = directions(np.array(air.sun).ravel(), float(np.array(air.asymmetry).ravel()[0]))
-        per_node = self._directions.shape[1]
-        self._sets = np.random.default_rng(2).permutation(np.arange(count) % SETS)
+        self._air, self._lattice = air, lattice
+        count, of_set = lattice.count, np.random.default_rng(2).permutation(np.arange(lattice.count) % SETS)
+        order = np.argsort(of_set, kind="stable")
+        rows = np.argsort(order)  # of nodes
+        ends = np.searchsorted(of_set[order], np.arange(SETS + 1))
+        sun, g = np.array(air.sun).ravel(), float(np.array(air.asymmetry).ravel()[0])
+        w, weights = directions(sun, g, SETS, ABOUT_SUN, AROUND)
+        per_node = w.shape[1]
         lane = dr.arange(mi.UInt32, count * per_node)
-        node, j = lane // per_node, lane % per_node
-        chosen = dr.gather(mi.UInt32, uints(self._sets), node) * per_node + j
-        d = mi.Vector3f(*row(table(self._directions.astype(np.float32)), chosen, 3))
+        node, j = dr.gather(mi.UInt32, uints(order), lane // per_node), lane % per_node
+        chosen = dr.gather(mi.UInt32, uints(of_set), node) * per_node + j
+        d = mi.Vector3f(*row(table(w.astype(np.float32)), chosen, 3))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, count * per_node)
-        ray = self._ray(scene, lattice.around(node, scene, sampler), d, sampler)
-        phases = self._phases(weights)
-        shares = self._shares(lattice.h)
-        stands_for = self._standing(np.array(ray["leaves"]).reshape(count, per_node))
-        near = dr.gather(mi.UInt32, uints(stands_for), ray["node"])
-        index = dr.fma(near, len(unfolded_directions()), ray["toward"])
-        lit, known = [], None
-        for n in range(PASSES) if most is None else range(max(most - PASSES, 0), most):
-            if not lit or most is not None:
-                lit = self._hidden(ray, 0 if most is None else most - 1 - n)
-            light = lit
-            if known is not None:
-                again = row(floats(known), index, air.count)
-                light = [dr.fma(f, m, v) for f, m, v in zip(ray["factor"], again, lit, strict=True)]
+        levels = 1 if most is None else min(PASSES, most)
+        p = lattice.around(node, scene, sampler)
+        share = dr.gather(mi.Float, floats(np.random.default_rng(3).random(count)), node) + j * STEPS[1]
+        share -= dr.floor(share)
+        rays = trace(scene, air, lattice, open_sky, max(levels, 1), p, d, share, sampler)
+        upper = (w @ np.array(air.globe.up) > 0.0)[of_set[order]]
+        sees = (np.array(rays.leaves).reshape(count, per_node) & upper).sum(axis=1) > OPEN * upper.sum(axis=1)
+        self._rows = uints(rows[nearest(sees[rows].reshape(lattice.shape), lattice.lines)])
+        phases, shares = self._phases(w, weights), self._shares(lattice.h[order])
+        parts = list(zip(ends[:-1], ends[1:], strict=True))
+        entry = dr.arange(types().UInt, count * unfolded.COUNT)
+        planes = [aligned((count, unfolded.COUNT)) for _ in range(air.count)]
+        self._table = None
+        for n in range(PASSES) if most is None else range(levels):
+            light = self._arriving(rays, 0 if most is None else levels - 1 - n).reshape(air.count, count, per_node)
+            self._table = None  # its memory serves the next one
+            # More threads would wait for each other: these matrices are small.
+            with threadpool_limits(limits=1, user_api="blas"):
+                scatter(light, phases, shares, parts, planes)
+            self._table = table_of([types().Float(plane.ravel()) for plane in planes], entry)
+
+    def _arriving(self, rays: HiddenRays, level: int) -> np.ndarray:
+        """Radiance (W) that shapes keep from nodes: [W, rays]."""
+        light = rays.hidden[level]
+        if self._table is not None:
+            again = self._at(self._table, rays.node, rays.toward, True)
+            light = [dr.fma(f, m, v) for f, m, v in zip(rays.factor, again, light, strict=True)]
             dr.eval(light)
-            known = self._scattered(np.stack(light).reshape(air.count, count, per_node), phases, shares)
-        self._table = floats(known[stands_for])
+        return np.stack(light)
 
-    def _standing(self, leaves: np.ndarray) -> np.ndarray:
-        """For each node one that is in the air, near it: itself where it sees the sky in OPEN of its upper half."""
-        upper = (self._directions @ np.array(self._air.globe.up) > 0.0)[self._sets]
-        known = (leaves & upper).sum(axis=1) > OPEN * upper.sum(axis=1)
-        return nearest(known.reshape(self._lattice.shape), self._lattice.lines)
+    def _at(self, known: Any, node: Any, toward: Any, active: Any) -> list[Any]:
+        """What the table has (W) at nodes, or those that stand for them."""
+        index = dr.fma(dr.gather(types().UInt, self._rows, node, active), unfolded.COUNT, toward)
+        return row(known, index, self._air.count, active=active)
 
-    def _ray(self, scene: Any, p: Any, d: Any, sampler: Any) -> dict[str, Any]:
-        """Of rays from nodes: what is known of each whatever the order."""
-        air, optics = self._air, self._air.bands[0].optics
-        scale, active = air.globe.scale, mi.Bool(True)
-        h, mu, mu_s, nu = air.globe.cosines(p, d, air.sun)
-        line = rays_to_boundary(optics, dr.minimum(h, optics.thickness), mu, mu_s, nu)
-        si = scene.ray_intersect(mi.Ray3f(p, d), mi.RayFlags.All, coherent=False, active=active)
-        behind = si.is_valid() & (si.t < line.stop * scale)
-        near = dr.select(behind, si.t * (1.0 / scale), 0.0)
-        lit = behind & ~scene.ray_test(si.spawn_ray(air.sun), behind)
-        amounts = air.columns(line, dr.zeros(mi.Float, dr.width(near)), near, [0.0 for _ in optics.constituents], PARTS)
-        through = []
-        for band in air.bands:
-            through += [dr.select(behind, dr.exp(-depth), 0.0) for depth in band.optics.optical_depths(amounts)]
+    def _phases(self, w: np.ndarray, weights: np.ndarray) -> list[Phases]:
+        """Of each wavelength."""
+        cosine = np.clip(w.astype(np.float32) @ unfolded.directions().T.astype(np.float32), -1.0, 1.0)
+        where, few = floats(cosine), floats(np.linspace(-1.0, 1.0, 64))
+        of_weights = weights[..., None].astype(np.float32)
+        moments = np.concatenate([w, w * w, w * np.roll(w, 1, axis=-1)], axis=-1) * weights[..., None]
+        apart = np.linalg.pinv(moments)
+        known: dict[Any, Any] = {}  # most phase functions are the same at all wavelengths
 
-        # One point of the air on the way.
-        _, last = self._lattice.interval(mi.Ray3f(p, d))
-        length = dr.maximum(dr.minimum(dr.select(behind, near, line.stop), last * (1.0 / scale)), SHORTEST)
-        rate = dr.maximum(air.guide.largest_extinction(air.guide.densities(h)), LEAST_EXTINCTION)
-        rate = dr.maximum(rate, LEAST_RANGE / length)
-        whole = 1.0 - dr.exp(-rate * length)
-        t = dr.minimum(-dr.log(1.0 - sampler.next_1d() * whole) / rate, length)
-        inverse = whole * dr.exp(rate * t) / rate
-        place = mi.Point3f(p + d * (t * scale))
-        dark = dr.select(scene.ray_test(mi.Ray3f(place, air.sun)), 1.0, 0.0)
-        there, r, sun_mu = point_along(optics, line, t)
-        amounts = air.columns(line, dr.zeros(mi.Float, dr.width(t)), t, [0.0 for _ in optics.constituents], PARTS)
-        shining = dark * visible_sun(optics, there, r, sun_mu)
-        single, factor = [], []
-        for band in air.bands:
-            o = band.optics
-            here = o.densities(there)
-            sunward = {k: o.phase_values(k, nu) for k in o.scatterers}
-            sun = air.sunlit(band, there, sun_mu, shining)
-            for c, depth in enumerate(o.optical_depths(amounts)):
-                seen = dr.exp(-depth) * inverse
-                single.append(seen * sun[c] * sum(o.scattering[k][c] * here[k] * sunward[k][c] for k in o.scatterers))
-                factor.append(seen * sum(o.scattering[k][c] * here[k] for k in o.scatterers))
-        node, inside = self._lattice.node(place, there, sampler, active)
-        toward = unfolded_node(d, sampler, active)
-        factor = [dr.select(inside, f, 0.0) for f in factor]
+        def of(k: int, optics: Any, c: int) -> tuple[bytes, np.ndarray | None, np.ndarray]:
+            key = np.array(optics.phase_values(k, few)[c] + mi.Float(0.0)).tobytes()
+            if key not in known:
+                value = np.array(optics.phase_values(k, where)[c] + mi.Float(0.0)).reshape(cosine.shape) * of_weights
+                value = unfolded.sharpened(value / value.sum(axis=1, keepdims=True))
+                few_rows = (apart @ value).astype(np.float32)
+                exact = np.abs(moments @ few_rows - value).max() < EXACT * np.abs(value).max()
+                known[key] = (key, moments.astype(np.float32), few_rows) if exact else (key, None, value)
+            return known[key]
 
-        # What a shape hides, and what its surface sends: diffuse, lit by the sun and by what its slope leaves of sky.
-        h, r, mu_s = point_along(optics, line, near)
-        mu = dr.clip(dr.fma(optics.radius + line.h, line.mu, near) / r, -UPRIGHT, UPRIGHT)
-        n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)
-        facing = dr.select(lit, dr.maximum(dr.dot(n, air.sun), 0.0), 0.0)
-        openness = 0.5 + 0.5 * sum(a * b for a, b in zip(n, air.globe.up, strict=True))
-        sent, c = [], 0
-        reflectance = self._reflectance(si, behind)
-        for band in air.bands:
-            sun = air.sunlit(band, h, mu_s, visible_sun(band.optics, h, r, mu_s))
-            sky = band.field.irradiance(h, mu_s, behind, reflected=True)
-            for e, s in zip(sun, sky, strict=True):
-                sent.append(reflectance[c] * dr.fma(e, facing, s * openness) * dr.inv_pi)
-                c += 1
-        found = {
-            "leaves": ~behind & ~line.ground,
-            "behind": behind,
-            "through": through,
-            "single": single,
-            "factor": factor,
-            "node": node,
-            "toward": toward,
-            "sent": sent,
-            "h": h,
-            "mu_s": mu_s,
-            "mu": mu,
-            "azimuth": relative_azimuth(mu, mu_s, line.nu),
-            "picks": (sampler.next_1d(), sampler.next_1d()),
-        }
-        dr.eval(found)
-        return found
-
-    def _hidden(self, ray: dict[str, Any], level: int) -> list[Any]:
-        """Radiance (W) that shapes keep from nodes, but for what is hidden of light that the air before them scatters
-        once more; ``level``: of the open sky."""
-        open_ = self._open_sky.radiance(
-            mi.UInt32(level), *(ray[k] for k in ("h", "mu_s", "mu", "azimuth")), *ray["picks"], ray["behind"]
-        )
-        parts = zip(ray["through"], open_, ray["sent"], ray["single"], strict=True)
-        return [dr.fma(t, o - s, single) for t, o, s, single in parts]
-
-    def _reflectance(self, si: Any, active: Any) -> list[Any]:
-        """Diffuse reflectance at each wavelength: in RGB that of the channels which the wavelength counts in."""
-        atmosphere = self._air.sky.atmosphere
-        if mi.is_spectral:
-            found, size = [], len(mi.UnpolarizedSpectrum(0.0))
-            nm = list(atmosphere.wavelengths_nm)
-            for i in range(0, len(nm), size):
-                some = nm[i : i + size]
-                si.wavelengths = type(si.wavelengths)(*(float(v) for v in some + [some[-1]] * (size - len(some))))
-                values = mi.UnpolarizedSpectrum(si.bsdf().eval_diffuse_reflectance(si, active))
-                found += [values[k] for k in range(len(some))]
-            return found
-        values = mi.UnpolarizedSpectrum(si.bsdf().eval_diffuse_reflectance(si, active))
-        shares = np.abs(Channels(SpectralBasis.of(atmosphere)).matrix)
-        shares = shares / np.maximum(shares.sum(axis=0), 1e-30)
-        return [sum(float(s) * values[c] for c, s in enumerate(column)) for column in shares.T]
-
-    def _phases(self, weights: np.ndarray) -> list[np.ndarray]:
-        """Of each wavelength: phase function times weight, [sets, scatterers x directions, directions of light], so
-        that the sum over directions is 1."""
-        cosine = np.clip(self._directions @ unfolded_directions().T, -1.0, 1.0)
-        found: list[np.ndarray] = []
+        found = []
         for band in self._air.bands:
             for c in range(band.optics.channel_count):
-                of_kinds = []
-                for k in band.optics.scatterers:
-                    value = band.optics.phase_values(k, floats(cosine))[c] + mi.Float(0.0)
-                    share = np.array(value, dtype=np.float32).reshape(cosine.shape) * weights[..., None]
-                    of_kinds.append((share / share.sum(axis=1, keepdims=True)).astype(np.float32))
-                found.append(np.concatenate(of_kinds, axis=1))
+                keys, left, right = zip(*(of(k, band.optics, c) for k in band.optics.scatterers), strict=True)
+                if keys not in known:
+                    known[keys] = Phases(list(left), np.concatenate(right, axis=1))
+                found.append(known[keys])
         return found
 
     def _shares(self, h: np.ndarray) -> np.ndarray:
-        """What each scatterer has of the scattering at altitudes: [scatterers, N, W]."""
+        """What each scatterer has of the scattering at altitudes: [scatterers, W, N, 1]."""
         found = []
         for band in self._air.bands:
             o = band.optics
             here = o.densities(floats(h))
-            values = [[np.array(o.scattering[k][c] * here[k]) for c in range(o.channel_count)] for k in o.scatterers]
-            found.append(np.moveaxis(np.array(values), 1, -1))
-        found = np.concatenate(found, axis=-1)
-        return (found / np.maximum(found.sum(axis=0), 1e-30)).astype(np.float32)
-
-    def _scattered(self, light: np.ndarray, phases: list[np.ndarray], shares: np.ndarray) -> np.ndarray:
-        """Light [W, nodes, directions] scattered once more: rows of a table, [nodes, directions of light, W]."""
-        wavelengths, count, _ = light.shape
-        found = np.zeros((count, phases[0].shape[-1], row_size(wavelengths)), dtype=np.float32)
-        for s in range(SETS):
-            own = np.flatnonzero(self._sets == s)
-            for c in range(wavelengths):
-                of_kinds = [light[c, own] * share[own, None, c] for share in shares]
-                found[own, :, c] = np.concatenate(of_kinds, axis=1) @ phases[c][s]
-        return found
+            channels = range(o.channel_count)
+            found.append([[np.array(o.scattering[k][c] * here[k]) for c in channels] for k in o.scatterers])
+        shares = np.concatenate(found, axis=1)
+        return (shares / np.maximum(shares.sum(axis=0), 1e-30)).astype(np.float32)[..., None]
 
     def missing(self, ray: Any, part: Stretch, sampler: Any, active: Any) -> list[Any]:
         """Light (radiance, W) that is missing from a stretch of a ray (scene units)."""
@@ -244,8 +172,7 @@ class HiddenLight:
             amounts = air.columns(rays, d, there, amounts, 1)
             h, _, _ = point_along(optics, rays, there)
             node, inside = self._lattice.node(ray((part.gap + there) * scale), h, sampler, active)
-            index = node * len(unfolded_directions()) + unfolded_node(ray.d, sampler, active)
-            hidden = row(self._table, index, air.count, active=active & inside)
+            hidden = self._at(self._table, node, unfolded.node(ray.d, sampler, active), active & inside)
             weight, new = dr.select(inside, whole / (rate * left * count), 0.0), []
             for band in air.bands:
                 o = band.optics
@@ -260,26 +187,20 @@ class HiddenLight:
         return dr.while_loop(state, lambda i, *_: i < count, point, label="hidden")[3]
 
 
-def directions(sun: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors [SETS, N, 3], some about the ``sun``, and their weights (sr): one over how many there are in a
-    steradian."""
-    rng, lobe = np.random.default_rng(1), HenyeyGreenstein(g)
-    axis = np.cross(sun, [1.0, 0.0, 0.0] if abs(sun[0]) < 0.9 else [0.0, 1.0, 0.0])
-    x = axis / np.linalg.norm(axis)
-    frame = np.stack([x, np.cross(sun, x), sun])
-    found = []
-    for _ in range(SETS):
-        parts = []
-        for n in (ABOUT_SUN, AROUND):
-            u, phi = fibonacci(n, *rng.random(2))
-            u = np.array(henyey_greenstein_cosine(mi.Float(g), mi.Float(u))) if n == ABOUT_SUN else 1.0 - 2.0 * u
-            sine = np.sqrt(np.maximum(1.0 - u * u, 0.0))
-            parts.append(np.stack([sine * np.cos(phi), sine * np.sin(phi), u], axis=-1))
-        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        found.append(np.concatenate([parts[0] @ frame, parts[1] @ turn]))
-    w = np.stack(found)
-    density = ABOUT_SUN * np.asarray(lobe.value(np.clip(w @ sun, -1.0, 1.0))) + AROUND * 0.25 / np.pi
-    return w, 1.0 / density
+def scatter(
+    light: np.ndarray,
+    phases: list[Phases],
+    shares: np.ndarray,
+    parts: list[tuple[int, int]],
+    scattered: list[np.ndarray],
+) -> None:
+    """Light [W, rows, directions] ``scattered`` once more, W times [rows, COUNT]; ``shares``: what each scatterer has
+    of the scattering, [scatterers, W, rows, 1]; ``parts``: first and last row of each set."""
+    for c, phase in enumerate(phases):
+        for s, (first, last) in enumerate(parts):
+            of_kinds = [light[c, first:last] * share[c, first:last] for share in shares]
+            of_kinds = [v if m is None else v @ m[s] for v, m in zip(of_kinds, phase.moments, strict=True)]
+            np.matmul(np.concatenate(of_kinds, axis=1), phase.rows[s], out=scattered[c][first:last])
 
 
 def nearest(known: np.ndarray, lines: list[np.ndarray]) -> np.ndarray:

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from atmo_jit.backend import row, row_size, table, types
+from atmo_jit.backend import floats, row, row_size, table, types
 
+from . import unfolded
 from .globe import Globe
 
-NODES = (48, 48, 16)  # along two level axes and up, at most
+NODES = (34, 34, 14)  # along two level axes and up, at most
 MOST_NUMBERS = 5e7  # by node, direction and wavelength: more wavelengths have fewer nodes
-BINS = 128  # of the density of nodes along an axis
-EVEN = 0.6  # of the nodes along a level axis that are spread evenly; the others stand where there is relief
+BINS = 512  # of the density of nodes along an axis
+EVEN = 0.1  # of the nodes along a level axis that are spread evenly; the others stand near relief
+NEAR = 0.2  # of the height of all shapes: so near relief nodes are as dense as at it
+FALL = 1.5  # power of the distance to relief that the density falls with
+FLAT = 0.01  # sine of a slope, up to which the extent of a shape does not count: that of a floor
 PROBES = 1 << 16  # rays that look for shapes
-SPREAD = 1.0  # of the height of all shapes, the air that is known as finely as that among them
-AROUND = 3.0  # of the size of all shapes, the air beside them
-SIDE = 19  # nodes along a side of the square that an octahedron unfolds to
+AROUND = 2.0  # of the size of all shapes, the air beside them
+FREE_PATHS = 3.0  # of light in the densest air: neither it nor their shadow matters farther off
 
 
 class Lattice:
-    """At most NODES in the air among, above and beside the shapes of a ``scene``: denser where there is relief, and
-    towards the lowest air.
+    """At most NODES in the air among, above and beside the shapes of a ``scene`` and in their shadow: denser near
+    relief, and towards the lowest air.
 
     Places are (a, b, h): metres along two level axes from the anchor of ``globe``, and altitude (m). Along each axis
     the number of nodes below a place is a piecewise linear function of it. ``sun``: unit vector towards it;
@@ -35,7 +37,7 @@ class Lattice:
     def __init__(
         self, scene: Any, globe: Globe, deepest: float, sun: np.ndarray, reach: float, wavelengths: int
     ) -> None:
-        numbers = float(np.prod(NODES)) * SIDE * SIDE * row_size(wavelengths)
+        numbers = float(np.prod(NODES)) * unfolded.COUNT * row_size(wavelengths)
         self.shape = tuple(max(int(n * min((MOST_NUMBERS / numbers) ** (1.0 / 3.0), 1.0)), 4) for n in NODES)
         self._globe = globe
         up = np.array(globe.up)
@@ -45,24 +47,28 @@ class Lattice:
         self.found = len(relief) > 0
         if not self.found:
             return
-        low, high = places.min(axis=0), places.max(axis=0)
+        steep = relief > FLAT
+        steep = places[steep] if steep.any() else places
+        low, high = steep.min(axis=0), steep.max(axis=0)
         low[2], high[2] = max(low[2], 0.0), max(high[2], 0.0)
         # The air beside and above them changes as well, the more so in their shadow.
         tall, wide = float(high[2] - low[2]), float(np.max(high - low))
-        shadow = tall * float(np.linalg.norm(np.cross(sun, up))) / max(float(sun @ up), 1e-3)
-        low[:2] -= min(max(AROUND * wide, shadow), reach)
-        high[:2] += min(max(AROUND * wide, shadow), reach)
-        high[2] = min(high[2] + min(max(AROUND * tall, 0.01 * wide), reach), globe.thickness)
+        beside, above = min(AROUND * wide, FREE_PATHS * reach), min(max(AROUND * tall, 0.01 * wide), FREE_PATHS * reach)
+        shadow = -(self._axes @ sun) * tall / max(float(sun @ up), 1e-3)
+        shadow *= min(1.0, FREE_PATHS * reach / max(float(np.linalg.norm(shadow)), 1e-3))
+        low[:2] -= np.maximum(beside, -shadow)
+        high[:2] += np.maximum(beside, shadow)
+        high[2] = min(high[2] + above, globe.thickness)
         self._low, self._size = low, high - low
         even = np.linspace(0.0, 1.0, BINS + 1)
+        middle = 0.5 * (even[1:] + even[:-1])
         warps = []
         for axis in range(2):
             share, _ = np.histogram(places[:, axis], BINS, (low[axis], high[axis]), weights=relief)
-            # Also where relief is as near as it is high.
-            near = max(round(SPREAD * tall * BINS / self._size[axis]), 0)
-            share = np.convolve(share, np.bartlett(2 * near + 3), mode="same")
+            gap = np.abs(middle[:, None] - middle) * self._size[axis]
+            share = (1.0 / (NEAR * tall + gap)) ** FALL @ share
             total = share.sum()
-            share = np.full(BINS, 1.0 / BINS) if total <= 0.0 else EVEN / BINS + (1.0 - EVEN) * share / total
+            share = np.full(BINS, 1.0) if total <= 0.0 else EVEN / BINS + (1.0 - EVEN) * share / total
             warps.append(np.concatenate([[0.0], np.cumsum(share)]) / share.sum())
         warps.append(np.sqrt(even))
         self._warps = table(np.stack([warp * count for warp, count in zip(warps, self.shape, strict=True)]).ravel())
@@ -84,7 +90,7 @@ class Lattice:
         start = low + (high - low) * rng.random((PROBES, 3))
         d = rng.normal(size=(PROBES, 3))
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*d.T.astype(np.float32)))
+        ray = mi.Ray3f(mi.Point3f(*(floats(v) for v in start.T)), mi.Vector3f(*(floats(v) for v in d.T)))
         si = scene.ray_intersect(ray)
         q, z = self._globe.relative(si.p)
         met = np.array(si.is_valid() & (self._globe.altitude(si.p) > -deepest))
@@ -100,7 +106,7 @@ class Lattice:
         return np.array(self._globe.anchor) + away * self._globe.scale
 
     def around(self, node: Any, scene: Any, sampler: Any) -> Any:
-        """Points about nodes, as near as the weights of linear interpolation fall off, with nothing between."""
+        """Points about nodes, at most half the way to the next, with nothing between."""
         p = mi.Point3f(*row(self._nodes, node, 3, 6))
         gaps = row(self._nodes, node, 6)[3:]
         steps = [gap * (sampler.next_1d() + sampler.next_1d() - 1.0) * self._globe.scale for gap in gaps]
@@ -144,31 +150,3 @@ class Lattice:
             x = dr.lerp(below, above, x - mi.Float(bin_)) - 0.5 + sampler.next_1d(active)
             index = index * count + dr.minimum(mi.UInt32(dr.maximum(x, 0.0)), count - 1)
         return index, inside
-
-
-def unfolded_directions() -> np.ndarray:
-    """Unit vectors [SIDE * SIDE, 3] at the nodes of the square that an octahedron unfolds to."""
-    y, x = (v.ravel() for v in np.meshgrid(*[np.linspace(-1.0, 1.0, SIDE)] * 2, indexing="ij"))
-    z = 1.0 - np.abs(x) - np.abs(y)
-    folded = np.maximum(-z, 0.0)
-    d = np.stack([x - np.copysign(folded, x), y - np.copysign(folded, y), z], axis=-1)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def unfolded_node(d: Any, sampler: Any, active: Any) -> Any:
-    """One of the four of :func:`unfolded_directions` about a direction, the nearer one more often."""
-    inverse = 1.0 / (dr.abs(d.x) + dr.abs(d.y) + dr.abs(d.z))
-    x, y = d.x * inverse, d.y * inverse
-    down = d.z < 0.0
-    x, y = (
-        dr.select(down, dr.copysign(1.0 - dr.abs(y), x), x),
-        dr.select(down, dr.copysign(1.0 - dr.abs(x), y), y),
-    )
-    i, j = (dr.minimum(mi.UInt32(dr.fma(0.5 * v + 0.5, SIDE - 1.0, sampler.next_1d(active))), SIDE - 1) for v in (x, y))
-    return j * SIDE + i
-
-
-def fibonacci(count: int, shift: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers in [0, 1) and angles (rad) that are even together."""
-    i = np.arange(count)
-    return (i + shift) / count, 2.0 * math.pi * ((i * 0.5 * (math.sqrt(5.0) - 1.0) + turn) % 1.0)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .exposed import number
+from .exposed import number, tensor
 from .panorama import (
     CELLS_AROUND,
     CELLS_DOWN,
@@ -45,10 +45,10 @@ EVEN_SHARE = 0.005
 
 def texture(values: Any, *, nearest: bool = False) -> Any:
     """A texture with the given texels [..., channels]: a NumPy array, or a TensorXf, whose gradient it keeps."""
-    tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
-    kind = {1: mi.Texture1f, 2: mi.Texture2f, 3: mi.Texture3f}[len(tensor.shape) - 1]
+    texels = values if isinstance(values, mi.TensorXf) else tensor(values)
+    kind = {1: mi.Texture1f, 2: mi.Texture2f, 3: mi.Texture3f}[len(texels.shape) - 1]
     mode = dr.FilterMode.Nearest if nearest else dr.FilterMode.Linear
-    return kind(tensor, use_accel=False, migrate=False, filter_mode=mode, wrap_mode=dr.WrapMode.Clamp)
+    return kind(texels, use_accel=False, migrate=False, filter_mode=mode, wrap_mode=dr.WrapMode.Clamp)
 
 
 class WarpLookup:

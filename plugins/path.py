@@ -14,31 +14,19 @@ from atmo_jit.solved import Sky
 from . import settings
 from .airlight import Airlight
 from .colours import Colours
-from .exposed import array, host, parameters_of, same
 from .exposed_atmosphere import ExposedAtmosphere
+from .followed import FollowedPictures
 from .globe import Globe
-from .hidden_light import PASSES, HiddenLight
-from .lattice import Lattice
-from .linearized import Changes, LinearizedSky, unit_changes
 from .near_ground import near_ground
-from .open_sky import OpenSky
-from .shadow_volume import shadowed_interval
+from .shaded import DEEPEST_M, ShadedAir, inscatter, lit
 from .skylight import Skylight
 from .volpath import mis_weight, unpolarized
 
-# Shapes lie in valleys at most this deep (m): below it the planet's ground hides them.
-DEEPEST_M = 500.0
-LEAST_DEPTH = 1e-3  # optical depth of the box around all shapes: shadows in thinner air are not looked for
-# Of a segment's light, that shapes may hide in one sample: those that weigh most would leave black specks. A bound of
-# 1 would make shadows too bright.
-MOST_HIDDEN = 2.0
 SKY_SHARE = 0.5  # of the directions at a surface that are drawn from the sky instead of the BSDF
-SCALES = ("sun_scale", "sky_scale")
-TABLES = ("sky_radiance", "sun_radiance")  # of the emitter; they say here only where to look for light
 AOVS = ("inscatter", "transmittance")
 
 
-class AtmospherePath:
+class AtmospherePath(FollowedPictures):
     """
     .. _integrator-atmosphere_path:
 
@@ -95,8 +83,8 @@ class AtmospherePath:
     integrated along every segment (never a difference of two look-ups), less the sunlight that shapes keep from it:
     where a segment may be in the shadow of the box around all shapes, rays to the sun are traced from some of its
     points, more where it scatters more. Scenes too small for that to matter skip it. Light of higher orders
-    that shapes keep from the air, less what their surfaces add, is a table that is made once, with 4.7 million rays
-    from 37 thousand points among, above and beside the shapes; it is made again when air or shapes change. Pictures
+    that shapes keep from the air, less what their surfaces add, is a table that is made once, with 4.1 million rays
+    from 16 thousand points among, above and beside the shapes; it is made again when air or shapes change. Pictures
     have no noise from it, but a bias close to shapes that hide most of the light (docs/method.md, docs/gallery.md).
     Two things in it are simplified: surfaces count as diffuse, and of the sky they see what their slope leaves of it,
     whatever else is in the way.
@@ -152,9 +140,7 @@ class AtmospherePath:
             if name not in AOVS:
                 raise AtmosphereError("aovs", shown(name), f"{' and '.join(AOVS)}, separated by a comma")
         self._held: tuple[Any, ...] | None = None
-        self._hidden: tuple[Any, ...] | None = None
-        self._solved: LinearizedSky | None = None
-        self._moving: tuple[Skylight, Airlight, Colours] | None = None  # while a derivative is rendered
+        self._shaded = ShadedAir(self.orders)
 
     # ---- parameters
 
@@ -168,55 +154,6 @@ class AtmospherePath:
         if self.exposed is not None and self.exposed.update():
             self._held = None
 
-    def _followed(self, scene: Any, params: Any) -> dict[str, Any]:
-        """The numbers by which derivatives are wanted. Raises InputError if some are wanted by anything else."""
-        emitter = self._emitter(scene)
-        found = (self.exposed or emitter.exposed).followed() | emitter.followed_scales
-        allowed = {value.index_ad for value in found.values()}
-        for key, value in params or ():
-            if key.rpartition(".")[2] in TABLES or not (dr.is_diff_v(value) and dr.grad_enabled(value)):
-                continue
-            if getattr(value, "index_ad", None) not in allowed:
-                raise InputError(f"{key}: atmosphere_path has no derivatives by it, only by the atmosphere's values")
-        return found
-
-    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-        changes = {name: host(dr.grad(value)) for name, value in self._followed(scene, params).items()}
-        return self._derivative(scene, sensor, seed, spp, changes)
-
-    def render_backward(
-        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-    ) -> None:
-        followed = self._followed(scene, params)
-        found = {name: np.zeros(len(value)) for name, value in followed.items()}
-        for name, i, change in unit_changes(followed):
-            moved = self._derivative(scene, sensor, seed, spp, change)
-            found[name][i] = float(dr.sum(moved.array * grad_in.array)[0])
-        for name, value in followed.items():
-            dr.accum_grad(value, array(found[name]))
-
-    def _derivative(self, scene: Any, sensor: Any, seed: Any, spp: int, changes: Changes) -> Any:
-        """How the picture changes along changes of numbers by name: see :mod:`.linearized`."""
-        emitter = self._emitter(scene)
-        air = (self.exposed or emitter.exposed).atmosphere
-        if self._solved is None or self._solved.atmosphere != air:
-            self._solved = LinearizedSky(air, self.orders)
-        apart, skies = self._solved.ends({name: v for name, v in changes.items() if name not in SCALES})
-        light, middle, colours = self._made(emitter, self._solved.sky)
-        pictures = []
-        with dr.suspend_grad():
-            for sky, sign in zip(skies, (-0.5, 0.5), strict=True):
-                there = middle.moved(sky)
-                moved = light.moved(there.solar, *(sign * apart * float(changes.get(n, [0.0])[0]) for n in SCALES))
-                self._moving = moved, there, colours
-                try:
-                    picture = self.render(scene, sensor, seed, spp, develop=True, evaluate=False)
-                    dr.eval(picture)
-                    pictures.append(picture)
-                finally:
-                    self._moving = None
-        return (pictures[1] - pictures[0]) * (1.0 / apart)
-
     # ---- light
 
     def aov_names(self) -> list[str]:
@@ -229,7 +166,8 @@ class AtmospherePath:
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> tuple[Any, Any, list[Any]]:
         light, air, colours = self._parts(scene)
-        hidden = self._hidden_light(scene, air)
+        shades = self.shaft_samples > 0 and self._shaded.matters(scene, air)
+        hidden = self._shaded.later_orders(scene, air, skies=self._moving is None) if shades else None
         lamps = [e for e in scene.emitters() if e is not light.emitter]
         lamp_list = light.pointers(lamps)
         context = mi.BSDFContext()
@@ -256,18 +194,20 @@ class AtmospherePath:
             shows = active & (surface | (depth > 0) | ~mi.Bool(self.hide_emitters))
 
             grounded = active & part.ground & ~surface
-            inscatter = self._inscatter(scene, sampler, ray, part, light, air, hidden, active)
-            lit = self._lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
+            scattered = part.light
+            if dr.hint(shades, mode="scalar"):
+                scattered = inscatter(scene, sampler, ray, part, light, air, hidden, self.shaft_samples, active)
+            sun_seen = lit(scene, ray(part.distance), light.toward_sun(sampler.next_2d(grounded)), grounded)
             disc = light.sun_pdf(ray.d) * dr.select(alone, 1.0, mis_weight(last_pdf, light.sun_pdf(ray.d)))
             disc = dr.select(active & ~surface & ~grounded, disc * light.sun_squeeze, 0.0)
-            ground = air.on_ground(ray(part.distance), lit)
-            arriving = light.sum(passed, inscatter, part.transmittance, ground, grounded, disc)
+            ground = air.on_ground(ray(part.distance), sun_seen)
+            arriving = light.sum(passed, scattered, part.transmittance, ground, grounded, disc)
             result += dr.select(shows, reflected * colours.of(arriving, ray.wavelengths), 0.0)
             seen |= shows
             passed = products(passed, part.transmittance)
             if dr.hint(len(self.aovs) > 0, mode="scalar"):
                 start = depth == 0
-                first_light = dr.select(start, colours.of(inscatter, ray.wavelengths), first_light)
+                first_light = dr.select(start, colours.of(scattered, ray.wavelengths), first_light)
                 first_passed = dr.select(start, colours.white(part.transmittance, ray.wavelengths), first_passed)
 
             # Lamps that the ray meets.
@@ -335,67 +275,6 @@ class AtmospherePath:
             values = first_light if name == "inscatter" else first_passed
             aovs += [values[i] for i in range(len(values))]
         return mi.Spectrum(result), seen, aovs
-
-    def _inscatter(
-        self,
-        scene: Any,
-        sampler: Any,
-        ray: Any,
-        part: Any,
-        light: Skylight,
-        air: Airlight,
-        hidden: HiddenLight | None,
-        active: Any,
-    ) -> list[Any]:
-        """What the air of a segment scatters, less what shapes keep from it (W)."""
-        if not self._shades(scene, air):
-            return part.light
-        toward = light.toward_sun(sampler.next_2d(active))
-        start, end = shadowed_interval(scene.bbox(), toward, ray, dr.select(active, part.distance, 0.0))
-        sample = sampler.next_1d(active)
-
-        def lit(distance: Any) -> Any:
-            return self._lit(scene, ray(distance), toward, active)
-
-        missing = air.shade(part, start, end, sample, self.shaft_samples, lit)
-        if hidden is not None:
-            later = hidden.missing(ray, part, sampler, active)
-            missing = [a + b for a, b in zip(missing, later, strict=True)]
-        return [a - dr.minimum(b, MOST_HIDDEN * a) for a, b in zip(part.light, missing, strict=True)]
-
-    def _hidden_light(self, scene: Any, air: Airlight) -> HiddenLight | None:
-        """What shapes keep of later orders, made again where the air or the shapes changed."""
-        if not self._shades(scene, air) or None in air.sources:
-            return None
-        shapes = parameters_of(scene.shapes())
-        if self._hidden is None or self._hidden[0] is not air or not same(self._hidden[1], shapes):
-            with dr.suspend_grad():
-                self._hidden = air, shapes, self._hidden_anew(scene, air)
-        return self._hidden[2]
-
-    def _hidden_anew(self, scene: Any, air: Airlight) -> HiddenLight | None:
-        sun = np.array(air.sun, dtype=np.float64).ravel()
-        lattice = Lattice(scene, air.globe, DEEPEST_M, sun, 1.0 / air.densest, air.count)
-        if not lattice.found:
-            return None
-        most, skies = None, [air.sky]
-        if self.orders is not None:
-            most = self.orders - 1
-            if self._moving is None:
-                # Light that a shape hides has been scattered less often than all that the field may hold.
-                skies = [Sky(air.sky.atmosphere, n) for n in range(most, max(most - PASSES, 0), -1)]
-        open_sky = OpenSky(skies, air.globe, scene.bbox(), sun)
-        return HiddenLight(scene, air, lattice, open_sky, most)
-
-    def _shades(self, scene: Any, air: Airlight) -> bool:
-        """Whether the shadows of shapes matter to the air."""
-        box = scene.bbox()
-        across = float(np.linalg.norm(np.array(box.max) - np.array(box.min))) / self.scale if box.valid() else 0.0
-        return self.shaft_samples > 0 and across * air.densest > LEAST_DEPTH
-
-    def _lit(self, scene: Any, p: Any, toward: Any, active: Any) -> Any:
-        """1 where no shape is between a point of the air and the sun, else 0."""
-        return dr.select(scene.ray_test(mi.Ray3f(p, toward), active), 0.0, 1.0)
 
     def _parts(self, scene: Any) -> tuple[Skylight, Airlight, Colours]:
         """The light of the scene's emitter, its air and the colours of both, made again where the emitter changed."""

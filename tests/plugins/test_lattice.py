@@ -1,9 +1,6 @@
-"""Where the light that shapes keep from the air is known: nodes, interpolation between them by chance, and what stands
-for nodes inside shapes."""
+"""Where the light that shapes keep from the air is known: nodes, and interpolation between them by chance."""
 
 from __future__ import annotations
-
-import itertools
 
 import drjit as dr
 import mitsuba as mi
@@ -65,33 +62,29 @@ def test_places_outside_are_told(lattice):
     assert np.array(inside).tolist() == [True, False, False]
 
 
-def test_the_mean_of_directions_interpolates(plugins):
-    from atmo_jit.plugins.lattice import unfolded_directions, unfolded_node
+def test_nodes_are_dense_near_shapes(lattice):
+    """On a level axis more of them lie within the block's own width of it than its share of the length, and gaps grow
+    with the distance."""
+    for axis, (first, last) in enumerate([(100.0, 500.0), (100.0, 300.0)]):
+        at, wide = lattice._low[axis] + lattice.lines[axis], last - first
+        near = np.mean((at > first - wide) & (at < last + wide))
+        assert near > 1.3 * 3.0 * wide / lattice._size[axis]
+        gaps = np.diff(at)
+        assert gaps.max() > 2.0 * gaps.min() and gaps.argmax() in (0, len(gaps) - 1)
+
+
+def test_shadows_are_among_the_nodes(plugins):
+    """Of a low sun in thin air: the shadow is long, but no longer than light goes."""
+    from atmo_jit.plugins.globe import Globe
+    from atmo_jit.plugins.lattice import FREE_PATHS, Lattice
 
     mi.set_variant("llvm_ad_mono")
-    nodes = unfolded_directions()
-    assert np.allclose(np.linalg.norm(nodes, axis=1), 1.0)
-    for d in np.random.default_rng(1).normal(size=(12, 3)):
-        d /= np.linalg.norm(d)
-        lane = dr.zeros(mi.Vector3f, SAMPLES) + mi.Vector3f(*map(float, d))
-        chosen = np.array(unfolded_node(lane, drawn(SAMPLES), mi.Bool(True)))
-        mean = nodes[chosen].mean(axis=0)
-        assert len(np.unique(chosen)) <= 4
-        assert mean / np.linalg.norm(mean) @ d > np.cos(np.radians(1.5))
-
-
-def test_what_stands_for_a_node_is_the_nearest_in_the_air(plugins):
-    from atmo_jit.plugins.hidden_light import nearest
-
-    known = np.random.default_rng(2).random((5, 4, 3)) < 0.2
-    lines = [np.array([0.0, 1.0, 4.0, 5.0, 9.0]), np.array([0.0, 2.0, 3.0, 7.0]), np.array([0.0, 1.5, 2.0])]
-    found = nearest(known, lines).reshape(known.shape)
-    there = list(zip(*np.nonzero(known), strict=True))
-    for at in itertools.product(*map(range, known.shape)):
-        distances = [
-            sum(abs(lines[k][a] - lines[k][b]) for k, (a, b) in enumerate(zip(at, to, strict=True))) for to in there
-        ]
-        stands = np.unravel_index(found[at], known.shape)
-        assert known[stands]
-        own = sum(abs(lines[k][a] - lines[k][b]) for k, (a, b) in enumerate(zip(at, stands, strict=True)))
-        assert own == pytest.approx(min(distances))
+    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 250]).scale([50, 50, 250])}
+    scene = mi.load_dict({"type": "scene", "block": block})
+    air = atmo_jit.Atmosphere.load("earth")
+    globe = Globe(air, np.array([0.0, 0.0, -air.bottom_radius_m]), 1.0)
+    sun = np.array([0.995, 0.0, 0.1])
+    for reach, expected in ((1e5, 500.0 * 9.95), (1e3, FREE_PATHS * 1e3)):
+        nodes = Lattice(scene, globe, 500.0, sun / np.linalg.norm(sun), reach, 3)
+        p = nodes._axes.T @ nodes._low[:2]
+        assert p[0] == pytest.approx(-expected - 50.0, rel=0.02)

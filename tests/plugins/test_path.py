@@ -8,6 +8,7 @@ import json
 import drjit as dr
 import numpy as np
 import pytest
+from towers import HAZE, SUN, camera, passes, shaded, tiles
 from ztests import assert_agree, of_passes
 
 import atmo_jit
@@ -15,56 +16,6 @@ from atmo_jit.errors import AtmosphereError, InputError
 from atmo_jit.spectrum import SpectralBasis
 
 mi = pytest.importorskip("mitsuba")
-
-SUN = np.array([0.25, 1.0, 0.5]) / np.linalg.norm([0.25, 1.0, 0.5])
-# One wavelength, so that noise is all that a picture and its twin differ by.
-HAZE = {
-    "wavelengths_nm": [550],
-    "solar_irradiance": [1.0],
-    "bottom_radius_m": 6360000,
-    "top_radius_m": 6420000,
-    "rayleigh": {"scattering_per_m": [1.3558e-5], "scale_height_m": 8000},
-    "mie": {
-        "scattering_per_m": [5e-5],
-        "single_scattering_albedo": [0.9],
-        "scale_height_m": 1200,
-        "phase": {"type": "cornette_shanks", "g": 0.76},
-    },
-    "ozone": None,
-    "ground_albedo": [0.0],
-    "sun_angular_radius_deg": 0.26,
-}
-LOW_SUN = np.array([0.08, 1.0, 0.1]) / np.linalg.norm([0.08, 1.0, 0.1])
-DUST = {
-    **HAZE,
-    "bottom_radius_m": 3389500,
-    "top_radius_m": 3489500,
-    "rayleigh": {"scattering_per_m": [2.45e-7], "scale_height_m": 11000},
-    "mie": {
-        "scattering_per_m": [3.909e-5],
-        "single_scattering_albedo": [0.86],
-        "scale_height_m": 11000,
-        "phase": {"type": "henyey_greenstein", "g": 0.775},
-    },
-}
-
-
-def passes(scene, count, spp):
-    """Pictures [count, height, width, channels] with seeds of their own."""
-    return np.stack([np.array(mi.render(scene, spp=spp, seed=i), dtype=np.float64) for i in range(count)])
-
-
-def tiles(pictures, size):
-    """Means over squares of ``size`` pixels."""
-    n, height, width, channels = pictures.shape
-    return pictures.reshape(n, height // size, size, width // size, size, channels).mean(axis=(2, 4))
-
-
-def camera(width, height, origin, target, **options):
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
-    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
-    return {"type": "perspective", "fov": 70, "to_world": to_world, "film": film, **options}
-
 
 def things():
     """Small things on a floor: a glossy ball, a rough one, a lamp and a mirror."""
@@ -105,31 +56,6 @@ def test_near_things_look_as_in_a_scene_without_air(plugins, variant):
     assert_agree(*found)
 
 
-def shaded(integrator, orders=None, grey=0.0, air=HAZE, sun=SUN, **options):
-    """Two towers, kilometres high, black or grey, between the camera and the sun, in haze."""
-    at, atmosphere = mi.ScalarTransform4f(), atmo_jit.Atmosphere.load(air)
-    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": grey}}
-    towers = {
-        "west": {"type": "cube", "to_world": at.translate([-1200, 6000, 1300]).scale([900, 400, 1500]), "bsdf": black},
-        "east": {"type": "cube", "to_world": at.translate([2000, 5000, 1000]).scale([900, 400, 1200]), "bsdf": black},
-    }
-    sensor = camera(48, 32, [0, 0, 100], [0, 1000, 260], far_clip=1e8)
-    if integrator == "atmosphere_path":
-        sky = {"type": "atmosphere", "atmosphere": json.dumps(air), "sun_direction": sun.tolist(), "altitude": 0.0}
-        sky["sun_scale"] = 0.0  # the disc itself would only add noise
-        orders = {} if orders is None else {"orders": orders}
-        depth = 1 if grey == 0.0 else 3
-        parts = {"integrator": {"type": integrator, "max_depth": depth, **orders, **options}, "sky": sky}
-    else:
-        from atmo_jit.plugins.planet import planet
-
-        parts = planet(atmosphere, sun_direction=sun, sun_radius_deg=0.26)
-        sensor["medium"] = parts.pop("air")
-        depth = -1 if orders is None else orders + 1
-        parts["integrator"] = {"type": integrator, "max_depth": depth, "hide_emitters": True}
-    return mi.load_dict({"type": "scene", "sensor": sensor, **parts, **towers})
-
-
 def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
     mi.set_variant("llvm_ad_mono")
     own = tiles(passes(shaded("atmosphere_path", 1), 8, 8), 8)
@@ -140,28 +66,6 @@ def test_shadows_in_the_air_are_those_of_path_traced_air(plugins):
     # The shadows are there, and what is known of them is known well.
     assert np.max(without / estimates[1].mean) > 1.5
     assert np.median(np.sqrt(estimates[1].variance) / estimates[1].mean) < 0.01
-
-
-@pytest.mark.parametrize(
-    ("orders", "grey"),
-    [(2, 0.0), pytest.param(3, 0.0, marks=pytest.mark.slow), pytest.param(None, 0.4, marks=pytest.mark.slow)],
-    ids=["two", "three", "all"],
-)
-def test_scattered_light_is_shaded_like_that_of_path_traced_air(plugins, orders, grey):
-    """Dust in which a low sun's beam is spent: nearly all light is of order 2 and more, and the towers hide where it
-    comes from also where they cast no shadow."""
-    mi.set_variant("llvm_ad_mono")
-    scenes = [shaded(f"atmosphere_{name}", orders, grey, air=DUST, sun=LOW_SUN) for name in ("path", "volpath")]
-    samples = (16, 128) if orders else (128, 1024)
-    own, truth = (of_passes(tiles(passes(scene, 16, n), 8)) for scene, n in zip(scenes, samples, strict=True))
-    free = shaded("atmosphere_path", orders, grey, air=DUST, sun=LOW_SUN, shaft_samples=0)
-    without = tiles(passes(free, 1, 8), 8)[0]
-    # Within 3 %, and a fifth of what shapes take: close to them it changes faster than from node to node.
-    allowed = 0.03 * truth.mean + 0.2 * np.maximum(without - truth.mean, 0.0)
-    assert np.all(np.abs(own.mean - truth.mean) < allowed + 3.0 * np.sqrt(own.variance + truth.variance))
-    # Shapes take light away, in some places most of it, and what is known of it is known well.
-    assert np.max(without / truth.mean) > 2.0
-    assert np.median(np.sqrt(truth.variance) / truth.mean) < 0.02
 
 
 def test_instances_are_the_shapes_that_they_stand_for(plugins):
