@@ -255,8 +255,8 @@ class TabulatedPhase:
 class LegendrePhase:
     """sum_l (2 l + 1) / (4 pi) chi_l P_l(nu) with the given ``coefficients`` chi_l: chi_0 = 1 and abs(chi_l) <= 1.
 
-    (The JSON calls them ``moments``, which here is the method that serves any order.) A truncated series may dip
-    below 0; it is used as given.
+    (The JSON calls them ``moments``, which here is the method that serves any order.) Where a truncated series
+    dips below 0, it is 0: no light is negative. Light that scatters more than once has its moments as given.
     """
 
     coefficients: np.ndarray
@@ -281,7 +281,7 @@ class LegendrePhase:
         for n in range(len(self.coefficients) - 1, 0, -1):
             series = (2 * n + 1) * float(self.coefficients[n])
             after, after_next = series + (2 * n + 1) / (n + 1) * nu * after - (n + 1) / (n + 2) * after_next, after
-        return (1.0 + nu * after - after_next / 2.0) * (0.25 / math.pi)
+        return module_of(nu).maximum((1.0 + nu * after - after_next / 2.0) * (0.25 / math.pi), 0.0)
 
     def moments(self, order: int) -> np.ndarray:
         """The moments chi_0 .. chi_order, float64 [order + 1], 0 beyond those given."""

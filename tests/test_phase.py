@@ -94,6 +94,17 @@ def test_a_long_legendre_series_reproduces_its_source():
     assert np.allclose(LegendrePhase(source.moments(80)).value(nu), source.value(nu), atol=1e-10)
 
 
+def test_a_series_that_dips_below_0_is_0_there():
+    nu = np.linspace(-1.0, 1.0, 101)
+    given = (1.0 + 3.0 * 0.9 * nu) / (4.0 * np.pi)
+    assert np.allclose(LegendrePhase([1.0, 0.9]).value(nu), np.maximum(given, 0.0), atol=FLOAT64)
+    phase = {"type": "legendre", "moments": [1.0, 0.9, 0.0, -0.5]}
+    air = atmo_jit.Atmosphere.load("earth").replace({"mie.phase": phase, "mie.scattering_per_m": 1e-3})
+    zenith = np.arange(0.0, 90.0, 5.0)
+    views = {"altitude_m": 0.0, "sun_zenith_deg": 40.0, "view_zenith_deg": zenith, "azimuth_deg": 180.0}
+    assert atmo_jit.sky(air, views).radiance.min() >= 0.0
+
+
 def test_a_table_scales_and_holds_its_ends():
     assert np.allclose(TabulatedPhase(TABLE.cos_theta, TABLE.values * 1e200).values, TABLE.values, rtol=FLOAT64)
     nu = np.array([-1.0, -0.75, -0.5, 0.0, 0.5, 1.0])
