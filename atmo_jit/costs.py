@@ -24,17 +24,17 @@ VIEWS_AT_ONCE = 1 << 18  # of atmo_jit.sky: bounds memory
 
 # --- printed by `python -m bench.constants` ---
 # CPU seconds per unit of each loop's size (see `loop_sizes`), kernels warm.
-SECONDS = {"fixed": 0.00789, "beam": 5.06e-09, "project": 1.81e-09, "gather": 6.88e-09, "contract": 0}
+SECONDS = {"fixed": 0.00552, "beam": 2.74e-09, "project": 0, "gather": 0, "contract": 4.25e-09}
 # CPU seconds of a view: first for every band of wavelengths, then for each moment of it.
-RAY_SECONDS = {"band": 1.98e-06, "moment": 7.77e-08}
+RAY_SECONDS = {"band": 1.14e-06, "moment": 4.79e-08}
 # MiB beyond imports: fixed, per square of the MiB of the largest table of order 1 (tables along the paths between the
 # nodes grow with the square of those at the nodes), per view evaluated at once.
-MEMORY = {"fixed": 10.9, "square": 0.525, "view": 0.000258}
+MEMORY = {"fixed": 11.7, "square": 1.2, "view": 0.000242}
 # 95th percentile of the error (per cent) by tolerance: clear air, haze, against independent references, their noise
 # included.
-ERRORS = {0.1: (1.1, 0.893), 0.03: (0.713, 0.756), 0.01: (0.395, 0.392), 0.003: (0.264, 0.321), 0.001: (0.222, 0.302)}
+ERRORS = {0.1: (0.481, 0.903), 0.03: (0.353, 0.647), 0.01: (0.242, 0.41), 0.003: (0.212, 0.379), 0.001: (0.196, 0.359)}
 # CPU nanoseconds of a pass of the bare loop of `bare_nanoseconds` on the machine that the constants are from.
-BARE_NANOSECONDS = 1.96
+BARE_NANOSECONDS = 0.406
 # --- end ---
 
 HAZE_DEPTH = 0.05  # optical depth of aerosol from which the second column of ERRORS holds
