@@ -5,13 +5,12 @@ import copy
 import drjit as dr
 import numpy as np
 import pytest
+from tolerances import ADJOINT
 
 import atmo_jit
 from atmo_jit import look_ups
 from atmo_jit.backend import floats, traversing, types
 from atmo_jit.harmonics import Harmonics
-
-from .tolerances import ADJOINT
 
 COUNT = 1000
 

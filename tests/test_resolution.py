@@ -76,7 +76,7 @@ def test_views_that_keep_away_from_the_horizon_need_fewer_degrees():
     for resolution in (high, replace(Resolution.suited(air, 0.002), **exact)):
         found = Sky(air, tolerance=0.002, resolution=resolution).rays(*map(doubles, rays)).radiance
         light.append(np.stack([channel.numpy() for channel in found]))
-    assert light[0] == pytest.approx(light[1], rel=0.02)
+    assert light[0] == pytest.approx(light[1], rel=0.01)
 
 
 def test_as_many_moments_as_are_asked_for():
