@@ -174,19 +174,6 @@ def table_of(values: Sequence[Any], lane: Any) -> Any:
     return tables_of([values], lane)[0]
 
 
-class Keeper:
-    """Something that keeps what was made from it: ``_kept``, a dictionary."""
-
-    _kept: dict[Any, Any]
-
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What ``make`` returns, made once."""
-        if key not in self._kept:
-            with noted.apart():
-                self._kept[key] = make()
-        return self._kept[key]
-
-
 def table(values: Any) -> Any:
     """A NumPy array [..., count] as a table of rows, of UInts if it is one of integers."""
     values = np.asarray(values)

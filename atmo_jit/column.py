@@ -23,9 +23,10 @@ import numpy as np
 
 from . import noted
 from ._trees import flat
-from .backend import Keeper, floats, packet, parameter, row, sum_loop, table_of, types
+from .backend import floats, packet, parameter, row, sum_loop, table_of, types
 from .geometry import altitude_along, distance_up, perigee_altitude
 from .grid import Grid
+from .kept import Keeper
 from .levels import thinnest
 from .optics import Optics
 from .profile import Exponential

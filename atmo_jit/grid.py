@@ -7,7 +7,6 @@ thin upper air gets its share. Sun nodes are uniform in x(theta), dense around t
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -16,7 +15,8 @@ import drjit as dr
 import numpy as np
 
 from .atmosphere import Atmosphere, Constituent
-from .backend import Keeper, floats, parameter, types
+from .backend import floats, parameter, types
+from .kept import Keeper, Remembered
 from .levels import corners
 from .profile import Tabulated
 from .resolution import Resolution, column_of
@@ -26,7 +26,8 @@ NEAREST = 50.0  # m: what is nearer to the ground is as near
 _PLANET = ("bottom_radius_m", "top_radius_m", "sun_angular_radius_deg")
 NEAR = 1  # powers of two between optical depths that may share a grid
 REACH = 1.0  # dips of the horizon beyond the wanted suns that are solved
-REMEMBERED = 8  # grids kept with all that was built on them
+REMEMBERED = 8  # grids kept with all that was built on them,
+REMEMBERED_BYTES = 2**28  # which may be hundreds of megabytes for one
 _DEEP_SHARES = 0.5, 2.0  # of bottom and top in deep air, whose light all comes through its top
 
 
@@ -39,7 +40,7 @@ class Grid(Keeper):
     angles (radians, at the observer) that is wanted; the nodes then are those of the full grid that can matter for it.
     """
 
-    _known: ClassVar[OrderedDict[Any, Grid]] = OrderedDict()
+    _known: ClassVar[Remembered] = Remembered(REMEMBERED, REMEMBERED_BYTES)
 
     @classmethod
     def of(
@@ -63,12 +64,7 @@ class Grid(Keeper):
             atmosphere.sun_angular_radius_deg,
             *((profile_key(c.profile), *_matter(atmosphere, c)) for c in atmosphere.constituents),
         )
-        if key not in cls._known:
-            cls._known[key] = cls(atmosphere, resolution, suns, profiles)
-        cls._known.move_to_end(key)
-        while len(cls._known) > REMEMBERED:
-            cls._known.popitem(last=False)
-        return cls._known[key]
+        return cls._known.of(key, lambda: cls(atmosphere, resolution, suns, profiles))
 
     @staticmethod
     def suits(nodes: Atmosphere, atmosphere: Atmosphere) -> bool:

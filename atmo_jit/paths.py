@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from .backend import Keeper, floats, table, uints
+from .backend import floats, table, uints
 from .grid import Grid
+from .kept import Keeper
 from .quadrature import gauss_legendre, running_integral, split_directions
 
 OPAQUE = 80.0  # optical depth, by the grid's bound (at most twice the true one), behind which points are left out

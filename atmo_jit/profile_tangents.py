@@ -15,7 +15,8 @@ from typing import Any
 import drjit as dr
 
 from . import noted
-from .backend import Keeper, packet, row_size, scattered, types
+from .backend import packet, row_size, scattered, types
+from .kept import Keeper
 from .optics import Optics
 
 SUN = -1  # owner of a column that depends on the sun's size

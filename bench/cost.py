@@ -33,37 +33,6 @@ def memory_mib(peak: bool = False) -> float:
     return next(float(line.split()[1]) for line in lines if line.startswith(name)) / 1024.0
 
 
-def bytes_kept(thing: Any) -> int:
-    """Bytes of all Dr.Jit and NumPy arrays that can be reached from an object: what keeping it costs.
-
-    Geometry that is shared between solves (``Grid``, and what hangs on it) is not counted.
-    """
-    import numpy as np
-
-    seen: set[int] = set()
-    buffers: dict[Any, int] = {}
-
-    def visit(value: Any) -> None:
-        if id(value) in seen or type(value).__name__ == "Grid":
-            return
-        seen.add(id(value))
-        if isinstance(value, np.ndarray):
-            buffers[id(value)] = value.nbytes
-        elif type(value).__module__.startswith("drjit") and hasattr(value, "index_ad"):
-            buffers[("drjit", value.index)] = len(value) * type(value)().numpy().dtype.itemsize
-        elif isinstance(value, dict):
-            for child in value.values():
-                visit(child)
-        elif isinstance(value, (list, tuple, set)):
-            for child in value:
-                visit(child)
-        elif hasattr(value, "__dict__") and not isinstance(value, type):
-            visit(vars(value))
-
-    visit(thing)
-    return sum(buffers.values())
-
-
 def timed(work: Any, repeats: int = REPEATS) -> dict[str, float]:
     """Median wall and CPU seconds of ``work()`` and of all kernels that it starts; it is called once before. Of fewer
     runs where these take long."""
@@ -96,6 +65,8 @@ def measure_here(method: str, setting: str, atmosphere: str, repeats: int, backe
 
     import atmo_jit.sky  # noqa: F401 - imports are not what is measured
     from atmo_jit.backend import floats, use
+    from atmo_jit.grid import Grid
+    from atmo_jit.kept import bytes_kept
 
     use(backend)
 
@@ -105,7 +76,7 @@ def measure_here(method: str, setting: str, atmosphere: str, repeats: int, backe
     cpu, wall = time.process_time(), time.perf_counter()
     solved = solve(setting, air)
     first = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-    result = {"first": first, "peak_mib": memory_mib(peak=True) - before, "bytes": bytes_kept(solved)}
+    result = {"first": first, "peak_mib": memory_mib(peak=True) - before, "bytes": bytes_kept(solved, (Grid,))}
     if repeats:
         result["warm"] = timed(lambda: solve(setting, air), repeats)
     return result

@@ -7,7 +7,6 @@ the same profiles (:mod:`atmo_jit.recording`); tracing them takes several times 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from ..backend import floats, one_at_a_time, parameter, types, uints
 from ..field import Field
+from ..kept import Remembered
 from ..phase import Isotropic, RayleighPhase
 from ..recording import Recordings
 from .cells import Cells
@@ -108,7 +108,7 @@ def packed(optics: Any, nodes: Nodes, nu: Any, toward_sun: Any, light: NodeLight
     return cells.words, colours
 
 
-_known: OrderedDict[Any, _Observer] = OrderedDict()
+_known = Remembered(REMEMBERED)
 
 
 @one_at_a_time
@@ -122,12 +122,7 @@ def light_at_nodes(band: Any, nodes: Nodes, ground: bool) -> Baked:
     )
     if optics.phase_kinds is None:  # kernels would hold numbers of the phase functions: nothing to be played back
         return _Observer(band, nodes, ground, quadrature).baked(band, nodes)
-    if key not in _known:
-        _known[key] = _Observer(band, nodes, ground, quadrature)
-    _known.move_to_end(key)
-    while len(_known) > REMEMBERED:
-        _known.popitem(last=False)
-    return _known[key].baked(band, nodes)
+    return _known.of(key, lambda: _Observer(band, nodes, ground, quadrature)).baked(band, nodes)
 
 
 class _Observer:

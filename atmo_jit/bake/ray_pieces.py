@@ -7,7 +7,6 @@ them, which are many, are made by a kernel.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -15,6 +14,7 @@ import numpy as np
 
 from ..backend import doubles, floats, stored, types, uints
 from ..grid import profile_key
+from ..kept import Remembered
 from ..march import MAX_TURN
 from ..optics import Optics
 from ..quadrature import gauss_legendre, running_integral
@@ -34,7 +34,7 @@ class Rays:
     start.
     """
 
-    _known: ClassVar[OrderedDict[Any, Rays]] = OrderedDict()
+    _known: ClassVar[Remembered] = Remembered(REMEMBERED)
 
     @classmethod
     def of(cls, optics: Optics, h: np.ndarray, mu: np.ndarray, *rest: Any) -> Rays:
@@ -51,12 +51,7 @@ class Rays:
             *(profile_key(c.profile) for c in optics.constituents),
             *(np.asarray(v).tobytes() if v is not None else None for v in (h, mu, *rest)),
         )
-        if key not in cls._known:
-            cls._known[key] = cls(optics, h, mu, *rest)
-        cls._known.move_to_end(key)
-        while len(cls._known) > REMEMBERED:
-            cls._known.popitem(last=False)
-        return cls._known[key]
+        return cls._known.of(key, lambda: cls(optics, h, mu, *rest))
 
     def __init__(
         self,

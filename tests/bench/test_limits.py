@@ -8,7 +8,7 @@ import pytest
 
 from atmo_jit.backend import floats, packet, types
 from bench import limits
-from bench.cost import bytes_kept, memory_mib, timed
+from bench.cost import memory_mib, timed
 
 
 def triangle(rows):
@@ -72,24 +72,6 @@ def test_stages():
     assert row["passes"] == {"outer": n.sum(), "inner": (n * (n - 1) // 2).sum()}
     least = row["instructions_per_s"] / machine["instructions_per_s"] + row["gathers_per_s"] / machine["gathers_per_s"]
     assert row["ratio"] == pytest.approx(1.0 / least)
-
-
-def test_bytes_kept():
-    class Thing:
-        def __init__(self):
-            self.a = np.zeros(10)
-            self.b = [floats(np.zeros(100)), {"c": self.a}]
-            self.again = self.b
-            self.me = self
-
-    class Grid:
-        def __init__(self):
-            self.big = np.zeros(1000)
-
-    thing = Thing()
-    assert bytes_kept(thing) == 80 + 400
-    thing.grid = Grid()
-    assert bytes_kept(thing) == 480
 
 
 def test_memory_and_time():
