@@ -22,6 +22,7 @@ from .errors import InputError
 
 _NAMES = ("llvm", "cuda")
 _selected = "llvm"
+_wide = False
 
 
 def use(name: str) -> None:
@@ -37,7 +38,33 @@ def types() -> ModuleType:
 
     Raises LLVMError when the LLVM backend is selected and no usable libLLVM is there.
     """
-    return _module(_selected)
+    return _widened(_selected) if _wide else _module(_selected)
+
+
+@contextmanager
+def double_precision() -> Iterator[None]:
+    """All that is computed in such a block is in double precision, at twice the cost: differences of solves then have
+    no noise, and derivatives can be compared with them. What was made outside is not to be used inside."""
+    global _wide
+    before, _wide = _wide, True
+    try:
+        yield
+    finally:
+        _wide = before
+
+
+@lru_cache(maxsize=2)
+def _widened(name: str) -> ModuleType:
+    module = _module(name)
+    wide = ModuleType(f"{module.__name__}.wide")
+    vars(wide).update({n: getattr(module, n) for n in dir(module) if not n.startswith("_")})
+    wide.Float, wide.ArrayXf = module.Float64, module.ArrayXf64
+    return wide
+
+
+def _real() -> Any:
+    """What NumPy calls a ``Float``."""
+    return np.float64 if _wide else np.float32
 
 
 @lru_cache(maxsize=2)
@@ -54,7 +81,7 @@ def _module(name: str) -> ModuleType:
 
 def floats(values: Any) -> Any:
     """A Dr.Jit ``Float`` buffer with the values of an array, flattened in C order."""
-    return types().Float(_copied(values, np.float32))
+    return types().Float(_copied(values, _real()))
 
 
 def doubles(values: Any) -> Any:
@@ -178,7 +205,7 @@ def table(values: Any) -> Any:
     """A NumPy array [..., count] as a table of rows, of UInts if it is one of integers."""
     values = np.asarray(values)
     whole = values.dtype.kind in "iu"
-    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.uint32 if whole else np.float32)
+    rows = np.zeros((*values.shape[:-1], row_size(values.shape[-1])), dtype=np.uint32 if whole else _real())
     rows[..., : values.shape[-1]] = values
     return (uints if whole else floats)(rows)
 

@@ -21,6 +21,7 @@ DARK = 1e-16
 # Depth of air that scatters nothing to speak of: the square of a smaller one, which is below the line in a derivative,
 # leaves single precision.
 NOTHING = 1e-15
+PEAKED = 2  # azimuthal orders, the highest, that tell what becomes of those that an order lacks
 SAME = 1e-6  # share of an order, squared, that rounding may be: beside that two orders are multiples of each other
 MISSED = 0.03  # of order 2: light that two modes of orders may fail to foretell
 
@@ -131,7 +132,8 @@ def _rest(
         L_lm = L_lm(order 1) r_l                          for l <= L, m > M,
         L_lm = L_lm(order 1) r_L (chi_l / chi_L)^n        for l > L,
 
-    where r_l is how order and order 1 compare at degree l, m >= 1: m = 0 has the horizon in it.
+    where r_l is how order and order 1 compare at degree l, m = M - 1 and M: lower ones, m = 0 above all, which has the
+    horizon in it, fade otherwise from order to order than those that are lacking.
     """
     t, channels, entries, (altitudes, suns) = types(), first.channels, pair_count(first.degree), grid.shape
     alike: dict[tuple[int, int], list[tuple[int, Moments, tuple[Any, Any]]]] = {}
@@ -237,7 +239,7 @@ def _peak(grid: Grid, reference: Reference, first: Moments, order: Moments) -> A
     k, l_ = node % altitudes, node // altitudes
     product, square = 0.0, 0.0
     scale = dr.gather(t.Float, reference.inverse, reference.index(k, sun, channel))
-    for m in range(min(order.most, 1), order.most + 1):
+    for m in range(max(min(order.most, 1), order.most - PEAKED + 1), order.most + 1):
         held = l_ >= m
         # Places of (l, m) are consecutive in l.
         a, b = (

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tolerances import DOUBLE
 from twins import Twin
 
 import atmo_jit
-from atmo_jit.backend import doubles
+from atmo_jit.backend import double_precision, doubles
 from atmo_jit.solved import Sky
 from bench.worlds import WORLDS, views_of, world
 
@@ -345,3 +346,12 @@ def test_nodes_of_another_profile_serve():
     )
     for a, b in zip(own, elsewhere, strict=True):
         assert b.numpy() == pytest.approx(a.numpy(), rel=5e-3)
+
+
+def test_single_precision_is_as_good_as_double():
+    rays = [doubles(v) for v in ([0.0, 200.0, 200.0], [1.4, 1.4, 0.3], [0.2, 1.56, 1.2], [0.5, 2.0, 1.0])]
+    found = [v.numpy() for v in Sky("earth").rays(*rays).radiance]
+    with double_precision():
+        exact = [v.numpy() for v in Sky("earth").rays(*rays).radiance]
+    assert all(v.dtype == np.float64 for v in exact)
+    np.testing.assert_allclose(found, exact, rtol=DOUBLE)

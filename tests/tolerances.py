@@ -40,6 +40,9 @@ SUN_MOVED = 2e-3
 # the ozone layer, by which the sky changes little, 4e-3 by scale heights.
 NODES_MOVED = 0.05
 
+# The light of all orders in single against double precision, of the sky overhead and at the horizon: measured 2e-6.
+DOUBLE = 1e-5
+
 # Derivatives of the sky against score-function Monte Carlo, without and with ``fine``: how many of 57 are off by more
 # than 1 % plus three sigma (measured 14 and 2), and by how much, as the change of the logarithm of the radiance per
 # change of the parameter's (measured by coefficients 6.1e-3 and 2e-4, by g 0.030 and 0.023, all on the hazy horizon:
