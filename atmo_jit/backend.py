@@ -312,6 +312,17 @@ def sum_loop(
     return dr.while_loop(start, lambda *a: condition(*a[:-1]), turn, max_iterations=-1, label=label)[:-1]
 
 
+def set_row(table: Any, values: Sequence[Any], index: Any, active: Any = True) -> None:
+    """Write row ``index`` of a table of rows of as many ``values``, one lane a row; what fills it up is 0."""
+    import drjit as dr
+
+    t, size = types(), row_size(len(values))
+    step, values = min(size, 8), [*values, *[t.Float(0.0)] * (size - len(values))]
+    for i in range(0, size, step):
+        part = t.ArrayXf(values[i : i + step]) if step > 1 else values[i]
+        dr.scatter(table, part, index * (size // step) + i // step, active)
+
+
 @contextmanager
 def traversing() -> Iterator[None]:
     """Derivatives are to be propagated through this package's kernels in such a block.

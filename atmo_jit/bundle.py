@@ -28,6 +28,7 @@ from .paths import Paths, points_along
 from .projection import add_harmonics
 from .quadrature import half_circle
 from .single_scattering import Sunbeam, azimuth_rows, azimuths_together, beam_along, sun_irradiance
+from .visits import Visits
 
 TWILIGHT = np.radians(85.0)  # beyond, the planet's shadow lies across the paths
 REFINE = (4, 12)  # levels per interval of the grid's altitudes at which sunlight is known: by day, at twilight
@@ -164,13 +165,14 @@ class Bundle:
         table = contracted(
             paths,
             self._moments(field, low, high, grid.first // per_node, channels),
-            weight_rows(optics, paths, weights.scattered, None, field.degree, orders),
+            weight_rows(optics, paths, weights.scattered, None, field.degree),
             count + 2,
             field.degree,
             orders,
             channels,
         )
-        device = paths.device
+        visits, device = Visits.of(paths, orders * channels), paths.device
+        first = visits.rows_of_suns(count + 2)
         lane = dr.arange(t.UInt, len(paths.h) * suns * azimuths)
         node = lane // azimuths
         ray = node // suns
@@ -190,7 +192,7 @@ class Bundle:
             cos_phi = relative_azimuth(dr.gather(t.Float, mus, i), turned, nu)
             scale = field.reference.at(dr.gather(t.UInt, device.level, i), x)
             place = dr.clip(x * per_node - offset, 0.0, count - 1.0)
-            inner = seen(table, i * (count + 2), place, count, cos_phi, orders, channels)
+            inner = seen(table, dr.gather(t.UInt, first, i), place, count, cos_phi, orders, channels, visits.together)
             return i + 1, [dr.fma(a, b, s) for a, b, s in zip(scale, inner, sums, strict=True)]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]

@@ -13,7 +13,6 @@ moments of a higher m than the result keeps are left out, of whatever degree the
 from __future__ import annotations
 
 from copy import copy
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -32,6 +31,7 @@ from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
 from .transposed import Readers, by_moments, by_table, by_weights, multilinear
+from .visits import Visits, weighed
 
 FAINT = 1e-15  # light of which no quotient is made: a derivative has its square below the line
 
@@ -61,11 +61,15 @@ class Samples:
         turned = dr.clip(dr.fma(cos_turn, mu_s, sin_turn * sin_s * cos_phi), -1.0, 1.0)
         self.place = stored([grid.sun_position(turned), relative_azimuth(mu, turned, nu)], lane, 2)
         self.suns, self.per_visit = suns, suns * azimuths
+        # Before the first sun of a table comes the second, mirrored, if suns start at the zenith.
+        self.skipped = int(not grid.whole_suns)
 
-    @cached_property
-    def readers(self) -> Readers:
-        """Who reads each sun of a table of all visits."""
-        return Readers(self.place.numpy().reshape(-1, self.per_visit, 2)[..., 0], self.suns)
+    def readers(self, visits: Visits) -> Readers:
+        """Who reads each row of a table of all visits and suns."""
+        x = self.place.numpy().reshape(-1, self.per_visit, 2)[..., 0]
+        return self.paths.kept(
+            ("readers", visits.together, self.per_visit), lambda: Readers(x, self.suns, self.skipped, visits)
+        )
 
 
 class Gather:
@@ -113,17 +117,22 @@ class Gather:
 
     def __call__(self, light: Moments) -> Any:
         """Azimuthal harmonics at the nodes (projection.stored_harmonics) of ``light`` after one more event."""
-        return self.along(light, self.weights(light.degree, min(light.most, self.most) + 1))
+        return self.along(light, self.weights(light.degree))
 
-    def weights(self, degree: int, orders: int) -> Any:
-        """What moments up to ``degree``, of as many azimuthal ``orders``, count along the paths (weight_rows)."""
-        return weight_rows(self.optics, self.paths, self.held["scattered"], self.held["reflected"], degree, orders)
+    def weights(self, degree: int) -> Any:
+        """What moments up to ``degree`` count along the paths (weight_rows): the same for every order."""
+        key = f"weights {degree}"
+        if key not in self.held:
+            both = self.held["scattered"], self.held["reflected"]
+            self.held[key] = weight_rows(self.optics, self.paths, *both, degree)
+        return self.held[key]
 
     def along(self, light: Moments, weights: Any) -> Any:
         """The same, with ``weights`` made before."""
         channels, suns = self.optics.channel_count, self.grid.shape[1]
-        orders = min(light.most, self.most) + 1
-        table = contracted(self.paths, self._rows(light, orders), weights, suns + 2, light.degree, orders, channels)
+        orders, skipped = min(light.most, self.most) + 1, self.samples.skipped
+        moments = self._rows(light, orders)
+        table = contracted(self.paths, moments, weights, suns + 1 - skipped, light.degree, orders, channels)
         return self._harmonics(interpolated(self.samples, self.held["scale"], table, orders, channels))
 
     def _harmonics(self, radiance: Any) -> Any:
@@ -152,34 +161,36 @@ class Gather:
         return stored_harmonics(sums, channels, azimuths)
 
     def _rows(self, light: Moments, orders: int) -> Any:
-        """Moments over the reference as a table [K, S + 2, l, m x channels], irradiance after the last l.
+        """Moments over the reference as a table [K, S, l, m x channels], irradiance after the last l.
 
-        The first sun mirrors the second (the sun has passed through the zenith: (-1)^m), the last is the one before.
+        Where suns start at the zenith one more comes first, which mirrors the second (the sun has passed through the
+        zenith: (-1)^m).
         """
         t, channels, grid, degree = types(), self.optics.channel_count, self.grid, light.degree
         altitudes, suns = grid.shape
-        rows, width = degree + 2, row_size(orders * channels)
+        mirrored = int(grid.whole_suns)
+        rows, width, count = degree + 2, row_size(orders * channels), suns + mirrored
 
-        def places() -> tuple[Any, Any, Any]:
-            """Where each entry of a row comes from, and its sign when mirrored; which sun is read."""
+        def places() -> tuple[Any, Any]:
+            """Where each entry of a row comes from, and its sign when mirrored."""
             place, sign = np.full((rows, width), -1), np.ones((rows, width))
             for l_ in range(degree + 1):
                 for m in range(min(l_ + 1, orders)):
                     for c in range(channels):
                         place[l_, m * channels + c] = pair_index(degree, l_, m)
-                        sign[l_, m * channels + c] = (-1.0) ** m if grid.whole_suns else 1.0
+                        sign[l_, m * channels + c] = (-1.0) ** m
             place[-1, :channels] = light.entries - 1
-            sun = np.arange(suns + 2) - 1
-            sun[0], sun[-1] = int(grid.whole_suns), suns - 1
-            return uints(place + 1), floats(sign), uints(sun)
+            return uints(place + 1), floats(sign)
 
-        place, sign, which = grid.kept(("rows", degree, light.most, orders, channels), places)
-        lane = dr.arange(t.UInt, altitudes * (suns + 2) * rows * width)
+        place, sign = grid.kept(("rows", degree, light.most, orders, channels), places)
+        lane = dr.arange(t.UInt, altitudes * count * rows * width)
         size = dr.opaque(t.UInt, rows * width, 1)
         node = lane // size
         entry = lane - node * size
-        sun, k = node % (suns + 2), node // (suns + 2)
-        there, channel = dr.gather(t.UInt, which, sun), entry % width % channels
+        sun, k = node % count, node // count
+        # Mirrored by the first of them is the second of the light, which comes third.
+        behind = (sun == 0) & t.Bool(grid.whole_suns)
+        there, channel = dr.select(behind, 1, sun - mirrored), entry % width % channels
         index = dr.gather(t.UInt, place, entry)
         held = index > 0
         every = (light.suns - 1) // (suns - 1)
@@ -188,18 +199,18 @@ class Gather:
         index = k * of_k + (dr.maximum(index, 1) - 1) * of_entry + there * of_sun + channel
         value = dr.gather(t.Float, light.values, index, held)
         inverse = dr.gather(t.Float, self.reference.inverse, self.reference.index(k, there, channel), held)
-        mirrored = dr.select(sun == 0, dr.gather(t.Float, sign, entry), 1.0)
-        values = value * inverse * mirrored
-        return evaluated(values)
+        return evaluated(value * inverse * dr.select(behind, dr.gather(t.Float, sign, entry), 1.0))
 
 
 def interpolated(samples: Samples, scale: Any, table: Any, orders: int, channels: int) -> Any:
     """Radiance at the nodes, [rays, S, azimuths, 4]: sum over visits of ``scale`` [visits, S, azimuths, 4] times the
-    ``table`` [visits, S + 2, m x channels] at the samples."""
-    t, paths, suns, per_visit = types(), samples.paths, samples.suns, samples.per_visit
+    ``table`` of ``contracted`` at the samples, with one more sun first as Gather has it."""
+    t, paths, suns, per_visit, skipped = types(), samples.paths, samples.suns, samples.per_visit, samples.skipped
+    visits, count = Visits.of(paths, orders * channels), suns + 1 - skipped
+    first = visits.rows_of_suns(count)
 
     def transposed(grad: Any, _: int, __: Any) -> Any:
-        return by_table(samples.readers, paths, samples.place, scale, grad, per_visit, suns, orders, channels)
+        return by_table(samples.readers(visits), paths, samples.place, scale, grad, per_visit, orders, channels)
 
     def radiance(table: Any) -> Any:
         lane = dr.arange(t.UInt, len(paths.h) * per_visit)
@@ -210,8 +221,8 @@ def interpolated(samples: Samples, scale: Any, table: Any, orders: int, channels
             place = i * per_visit + sample
             x, cos_phi = packet(samples.place, place, 2)
             factor = packet(scale, place, 4)
-            # The table has one more sun before the first and after the last.
-            inner = seen(table, i * (suns + 2), x, suns, cos_phi, orders, channels)
+            place, beside = dr.gather(t.UInt, first, i), (skipped, count - 1)
+            inner = seen(table, place, x, suns, cos_phi, orders, channels, visits.together, beside)
             return i + 1, [dr.fma(factor[c], inner[c], sums[c]) for c in range(channels)]
 
         zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(channels)]
@@ -221,13 +232,28 @@ def interpolated(samples: Samples, scale: Any, table: Any, orders: int, channels
     return multilinear(radiance, transposed, table)
 
 
-def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, channels: int) -> list[Any]:
-    """Sum over m of cos(m phi) times a table [suns + 2, m x channels], from row ``first`` on, cubic at the sun
-    coordinate ``x``."""
+def seen(
+    table: Any,
+    first: Any,
+    x: Any,
+    suns: int,
+    cos_phi: Any,
+    orders: int,
+    channels: int,
+    apart: int,
+    ends: tuple[int, int] | None = None,
+) -> list[Any]:
+    """Sum over m of cos(m phi) times a table [suns + 2, m x channels], cubic at the sun coordinate ``x``. Its rows are
+    so far ``apart``, from ``first`` on. The table has one sun more before the first and after the last; with ``ends``
+    not as many as it says before, and none after that row: light there is that of the nearest."""
     t = types()
     s = dr.minimum(t.UInt(x), suns - 2)
     taps = cubic(x - t.Float(s))
-    corners = [row(table, first + s + n, orders * channels, alone=True) for n in range(4)]
+    places = [s + n for n in range(4)]
+    if ends:
+        skipped, last = ends
+        places = [dr.minimum(dr.maximum(place, skipped) - skipped, last) for place in places]
+    corners = [row(table, first + place * apart, orders * channels, alone=True) for place in places]
     cos_m, cos_before = 1.0, cos_phi
     total = [0.0] * channels
     for m in range(orders):
@@ -242,70 +268,75 @@ def seen(table: Any, first: Any, x: Any, suns: int, cos_phi: Any, orders: int, c
 
 
 def contracted(paths: Paths, moments: Any, weights: Any, suns: int, degree: int, orders: int, channels: int) -> Any:
-    """G, table [visits, suns, m x channels]: ``moments`` [K, suns, l, m x channels] seen along each path, weighed by
-    ``weights`` [visits, l, m x channels] and summed over l."""
-    rows, width = degree + 2, orders * channels
+    """G, table of rows [m x channels] of visits and suns (visits.rows_of_suns): ``moments`` [K, suns, l, m x channels]
+    seen along each path, each times its harmonic in the path's direction, weighed by ``weights`` [visits, l, channels]
+    and summed over l."""
+    visits, shape = Visits.of(paths, orders * channels), (suns, degree + 2, orders, channels)
+    basis = harmonics_along(paths, degree, orders)
 
     def transposed(grad: Any, number: int, moments: Any, weights: Any) -> Any:
         if number:
-            return by_weights(paths, grad, moments, suns, rows, width)
-        nodes = dr.width(moments) // (suns * rows * row_size(width))
-        return by_moments(paths, grad, weights, nodes, suns, rows, width)
+            return by_weights(visits, grad, moments, basis, *shape)
+        nodes = dr.width(moments) // (suns * (degree + 2) * row_size(orders * channels))
+        return by_moments(visits, grad, weights, basis, nodes, *shape)
 
     with noted.passing():
-        return multilinear(lambda *both: _contracted(paths, *both, suns, rows, width), transposed, moments, weights)
+        return multilinear(lambda *both: _contracted(visits, *both, basis, *shape), transposed, moments, weights)
 
 
-def _contracted(paths: Paths, moments: Any, weights: Any, suns: int, rows: int, width: int) -> Any:
-    t = types()
-    lane = dr.arange(t.UInt, len(paths.station) * suns)
-    sun, visit = lane % suns, lane // suns
-    node = dr.gather(t.UInt, paths.device.level, visit) * suns + sun
+def _contracted(
+    visits: Visits, moments: Any, weights: Any, basis: Any, suns: int, rows: int, orders: int, channels: int
+) -> Any:
+    t, width = types(), orders * channels
+    # A lane takes the visits of a group: what it reads of the light at their level serves all of them.
+    lane = dr.arange(t.UInt, visits.groups * suns)
+    group = lane // suns
+    sun, members = lane - group * suns, packet(visits.members, group, visits.together)
+    node, size = dr.gather(t.UInt, visits.level, group) * suns + sun, dr.opaque(t.UInt, rows, 1)
 
-    size = dr.opaque(t.UInt, rows, 1)
+    def add(l_: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+        light, new = row(moments, node * size + l_, width, alone=True), []
+        for visit, old in zip(members, sums, strict=True):
+            counts = weighed(basis, weights, visit * size + l_, orders, channels)
+            new.append([dr.fma(w, v, s) for w, v, s in zip(counts, light, old, strict=True)])
+        return l_ + 1, new
 
-    def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        weight, value = (
-            row(table, place * size + l_, width, alone=True) for table, place in ((weights, visit), (moments, node))
-        )
-        return l_ + 1, [dr.fma(w, v, s) for w, v, s in zip(weight, value, sums, strict=True)]
-
-    zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in members]
     _, sums = dr.while_loop((t.UInt(0), zero), lambda i, _: i < size, add, max_iterations=-1, label="contract")
-    return table_of(sums, lane)
+    fill = [t.Float(0.0)] * (row_size(width) - width)
+    return stored([v for values in sums for v in [*values, *fill]], lane, visits.together * row_size(width))
 
 
-def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, degree: int, orders: int) -> Any:
-    """What a moment counts at each visit, table [visits, l, m x channels]: harmonic times weight times phase moment;
-    after the last l the ground's part of the irradiance (None: left out)."""
-    t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
-    rows = degree + 2
+def harmonics_along(paths: Paths, degree: int, orders: int) -> Any:
+    """P_lm(mu) at every visit, table [visits, l, m]; after the last l 1 for m = 0: the irradiance has no direction."""
 
-    def harmonics() -> Any:
+    def make() -> Any:
         values = legendre(degree, paths.mu[paths.station])
-        out = np.zeros((len(values), rows, orders))
+        out = np.zeros((len(values), degree + 2, orders))
         for place, (l_, m) in enumerate(zip(*pairs(degree), strict=True)):
             if m < orders:
                 out[:, l_, m] = values[:, place]
+        out[:, -1, 0] = 1.0
         return table(out)
 
-    basis = paths.kept(("harmonics", degree, orders), harmonics)
+    return paths.kept(("harmonics", degree, orders), make)
+
+
+def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, degree: int) -> Any:
+    """What a moment counts at each visit beside its harmonic, table [visits, l, channels]: weight times phase moment;
+    after the last l the ground's part of the irradiance (None: left out)."""
+    t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
     chi = optics.phase_moments(degree + 1)
-    lane = dr.arange(t.UInt, len(paths.station) * rows)
+    lane = dr.arange(t.UInt, len(paths.station) * (degree + 2))
     # Sizes are read from memory: one kernel for all of them.
-    size = dr.opaque(t.UInt, rows, 1)
+    size = dr.opaque(t.UInt, degree + 2, 1)
     visit = lane // size
     l_ = lane - visit * size
-    products = [0.0] * channels
+    last = l_ == size - 1
+    values = [t.Float(0.0)] * channels
     if kinds:
         weight, moment = row(scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
         for n in range(kinds):
-            products = [
-                dr.fma(weight[n * channels + c], moment[n * channels + c], products[c]) for c in range(channels)
-            ]
-    values = [harmonic * p for harmonic in row(basis, lane, orders) for p in products]
-    if reflected is not None:
-        last = l_ == size - 1
-        ground = row(reflected, visit, channels, active=last)
-        values[:channels] = [dr.select(last, r, v) for r, v in zip(ground, values, strict=False)]
-    return table_of(values, lane)
+            values = [dr.fma(weight[n * channels + c], moment[n * channels + c], values[c]) for c in range(channels)]
+    ground = row(reflected, visit, channels, active=last) if reflected is not None else [t.Float(0.0)] * channels
+    return table_of([dr.select(last, r, v) for r, v in zip(ground, values, strict=True)], lane)

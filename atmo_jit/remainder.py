@@ -20,7 +20,7 @@ import numpy as np
 
 from . import noted
 from .backend import evaluated, floats, row, row_size, table, types
-from .gather import Gather
+from .gather import Gather, harmonics_along
 from .grid import Grid, cubic
 from .projection import Moments, Projection, room
 from .refinement import DEEPEST, STEEPEST
@@ -52,8 +52,7 @@ class Remainder:
         self._channels = gather.optics.channel_count
         guide = _Guide(gather.grid, self._channels, held["log"], held["inverse"])
         self._gather = gather.signed(guide, made and made["scale"])
-        orders = project.most + 1
-        weights = made["weights"] if made else gather.weights(project.degree, orders)
+        weights = made["weights"] if made else gather.weights(project.degree)
         self.made = {"weights": weights, "scale": self._gather.held["scale"]}
 
     def moments(self, light: Any) -> Moments:
@@ -364,7 +363,9 @@ def _upright(gather: Gather, project: Projection) -> np.ndarray:
     """K_0, float64 [channels, n, n]: K for azimuthal order 0 and light that is alike under all suns."""
     paths, channels, altitudes = gather.paths, gather.optics.channel_count, gather.grid.shape[0]
     rows, rays = project.degree + 2, len(paths.h)
-    weights = gather.weights(project.degree, 1).numpy().reshape(len(paths.station), rows, -1)
+    count = len(paths.station)
+    basis = harmonics_along(paths, project.degree, 1).numpy().reshape(count, rows, -1)[..., :1]
+    weights = gather.weights(project.degree).numpy().reshape(count, rows, -1) * basis
     place = paths.ray[paths.station] * altitudes + paths.level
     seen = np.empty((channels, rays, altitudes, rows))
     for c in range(channels):

@@ -32,7 +32,7 @@ from .views import side_by_side
 
 # Share of the usual remainder that is left where derivatives are wanted, and fine ones: those of the light that orders
 # left out would add are less exact than that light.
-SURE, FINE = 0.03, 0.0005
+SURE, FINE = 0.03, 0.002
 
 
 @dataclass

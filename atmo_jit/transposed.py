@@ -13,11 +13,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, row_size, stored, table_of, types, uints
+from .backend import floats, packet, row, row_size, set_row, table_of, types, uints
 from .paths import Paths
 from .projection import add_harmonics
+from .visits import Visits, weighed
 
-SUNS, ROWS = 5, 2  # that a lane of by_moments takes
+SUNS, ROWS = 2, 2  # that a lane of by_moments takes
 
 
 def multilinear(function: Callable[..., Any], transposed: Callable[..., list[Any]], *inputs: Any) -> Any:
@@ -55,107 +56,124 @@ class _Multilinear(dr.CustomOp):
         return "multilinear"
 
 
-def by_moments(paths: Paths, grad: Any, weights: Any, nodes: int, suns: int, rows: int, width: int) -> Any:
-    """Derivative by the moments that gather.contracted reads, table [nodes, suns, l, width]: sums over the visits at a
-    node's level of derivative ``grad`` [visits, suns, width] times weight."""
-    t = types()
-
-    def at_levels() -> tuple[Any, Any]:
-        order = np.argsort(paths.level, kind="stable")
-        return uints(order), uints(np.searchsorted(paths.level[order], np.arange(nodes + 1)))
-
-    order, first = paths.kept(("visits at levels", nodes), at_levels)
-    # A lane takes a part of some rows under some suns: what it reads for one of them serves the others.
-    size, whole = min(row_size(width), 8), row_size(width)
-    parts, some, few = (dr.opaque(t.UInt, n, 1) for n in (whole // size, -(-suns // SUNS), -(-rows // ROWS)))
+def by_moments(
+    visits: Visits, grad: Any, weights: Any, basis: Any, nodes: int, suns: int, rows: int, orders: int, channels: int
+) -> Any:
+    """Derivative by the moments that gather.contracted reads, table [nodes, suns, l, m x channels]: sums over the
+    visits at a node's level of derivative ``grad`` by what it returns times weight times harmonic."""
+    t, width, together = types(), orders * channels, visits.together
+    of_levels = visits.first[np.minimum(np.arange(nodes + 1), len(visits.first) - 1)]
+    first = visits.paths.kept(("groups at levels", together, nodes), lambda: uints(of_levels))
+    # A lane takes some rows under some suns: what it reads for one of them serves the others.
+    some, few = (dr.opaque(t.UInt, n, 1) for n in (-(-suns // SUNS), -(-rows // ROWS)))
     per_level, per_sun = dr.opaque(t.UInt, suns, 1), dr.opaque(t.UInt, rows, 1)
-    lane = dr.arange(t.UInt, nodes * -(-suns // SUNS) * -(-rows // ROWS) * (whole // size))
-    place = lane // parts
-    part, node = lane - place * parts, place // few
-    row_, level = (place - node * few) * ROWS, node // some
+    lane = dr.arange(t.UInt, nodes * -(-suns // SUNS) * -(-rows // ROWS))
+    node = lane // few
+    row_, level = (lane - node * few) * ROWS, node // some
     sun = (node - level * some) * SUNS
-    start, stop = (dr.gather(t.UInt, first, level + i) for i in (0, 1))
+    start, stop = (dr.gather(t.UInt, first, level + i) * together for i in (0, 1))
     suns_, rows_ = [sun + i for i in range(SUNS)], [row_ + i for i in range(ROWS)]
 
     def add(i: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
-        visit = dr.gather(t.UInt, order, i)
-        come, held = (
-            [packet(table, (visit * count + dr.minimum(at, count - 1)) * parts + part, size) for at in places]
-            for table, count, places in ((grad, per_level, suns_), (weights, per_sun, rows_))
-        )
-        new = [(one, other) for one in come for other in held]
+        member = i - i // together * together
+        group = dr.gather(t.UInt, visits.at_levels, i // together)
+        visit, place = dr.gather(t.UInt, visits.members, group * together + member), group * per_level
+        come = [row(grad, (place + dr.minimum(at, per_level - 1)) * together + member, width) for at in suns_]
+        counts = [
+            weighed(basis, weights, visit * per_sun + dr.minimum(at, per_sun - 1), orders, channels) for at in rows_
+        ]
+        both = [(one, other) for one in come for other in counts]
         return i + 1, [
-            [dr.fma(a, b, s) for a, b, s in zip(*both, old, strict=True)] for both, old in zip(new, sums, strict=True)
+            [dr.fma(a, b, s) for a, b, s in zip(*two, old, strict=True)] for two, old in zip(both, sums, strict=True)
         ]
 
-    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(size)] for _ in range(SUNS * ROWS)]
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(SUNS * ROWS)]
     _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
     dr.eval(sums)  # each of the scatters would run the loop again
-    found = dr.zeros(t.Float, nodes * suns * rows * whole)
+    found = dr.zeros(t.Float, nodes * suns * rows * row_size(width))
     for values, (at, l_) in zip(sums, ((at, l_) for at in suns_ for l_ in rows_), strict=True):
-        index = ((level * per_level + at) * per_sun + l_) * parts + part
-        there = (at < per_level) & (l_ < per_sun)
-        dr.scatter(found, t.ArrayXf(values) if size > 1 else values[0], index, there)
+        set_row(found, values, (level * per_level + at) * per_sun + l_, (at < per_level) & (l_ < per_sun))
     dr.eval(found)
     return found
 
 
-def by_weights(paths: Paths, grad: Any, moments: Any, suns: int, rows: int, width: int) -> Any:
-    """The same by the weights, table [visits, l, width]: sums over suns."""
-    t, together = types(), 1 + (rows % 2 == 0)
-    lane = dr.arange(t.UInt, len(paths.station) * rows // together)
-    size, per_level = dr.opaque(t.UInt, rows // together, 1), dr.opaque(t.UInt, suns, 1)
-    visit = lane // size
-    l_, node = lane - visit * size, dr.gather(t.UInt, paths.device.level, visit) * per_level
+def by_weights(
+    visits: Visits, grad: Any, moments: Any, basis: Any, suns: int, rows: int, orders: int, channels: int
+) -> Any:
+    """The same by the weights, table [visits, l, channels]: sums over suns, times the harmonics."""
+    t, width, together, beside = types(), orders * channels, visits.together, 1 + (rows % 2 == 0)
+    lane = dr.arange(t.UInt, visits.groups * (rows // beside))
+    size, per_level = dr.opaque(t.UInt, rows // beside, 1), dr.opaque(t.UInt, suns, 1)
+    group = lane // size
+    l_, node = lane - group * size, dr.gather(t.UInt, visits.level, group) * per_level
 
     def add(sun: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
-        come, place = row(grad, visit * per_level + sun, width), ((node + sun) * size + l_) * together
+        come = [row(grad, (group * per_level + sun) * together + i, width) for i in range(together)]
+        light = [row(moments, ((node + sun) * size + l_) * beside + i, width) for i in range(beside)]
+        both = [(one, other) for one in come for other in light]
         return sun + 1, [
-            [dr.fma(a, b, s) for a, b, s in zip(come, row(moments, place + i, width), old, strict=True)]
-            for i, old in enumerate(sums)
+            [dr.fma(a, b, s) for a, b, s in zip(*two, old, strict=True)] for two, old in zip(both, sums, strict=True)
         ]
 
-    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(together)]
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(together * beside)]
     state = t.UInt(0), zero
     _, sums = dr.while_loop(state, lambda i, _: i < per_level, add, max_iterations=-1, label="transposed")
-    fill = [t.Float(0.0)] * (row_size(width) - width)
-    return stored([v for values in sums for v in [*values, *fill]], lane, together * row_size(width))
+    members = packet(visits.members, group, together)
+    places = [(visit * size + l_) * beside + i for visit in members for i in range(beside)]
+    counts = []
+    for place, values in zip(places, sums, strict=True):
+        harmonics = row(basis, place, orders)
+        counts.append([_dot(harmonics, values[c::channels]) for c in range(channels)])
+    for i in range(beside, len(places)):  # of a visit that is there twice the last has it all
+        before = zip(counts[i], counts[i - beside], strict=True)
+        counts[i] = [a + dr.select(places[i] == places[i - beside], b, 0.0) for a, b in before]
+    dr.eval(counts)
+    found = dr.zeros(t.Float, len(visits.place) * rows * row_size(channels))
+    for place, values in zip(places, counts, strict=True):
+        set_row(found, values, place)
+    dr.eval(found)
+    return found
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total
 
 
 class Readers:
-    """Who reads each row of a table [visits, suns + 2, m x channels], cubically at the sun coordinates ``x`` [visits,
-    samples]: per row, from ``first``, the sample and its weight."""
+    """Who reads each row of a table of ``visits`` and suns (Visits.rows_of_suns), cubically at the sun coordinates
+    ``x`` [visits, samples]: per row, from ``first``, the sample and its weight; ``visit`` of each row. ``skipped``: see
+    gather.seen."""
 
-    def __init__(self, x: np.ndarray, suns: int) -> None:
-        visits, samples = x.shape
+    def __init__(self, x: np.ndarray, suns: int, skipped: int, visits: Visits) -> None:
+        count = suns + 1 - skipped
         s = np.minimum(x.astype(np.int64), suns - 2)
         f = x - s.astype(np.float32)
         g = np.float32(1.0) - f
         weights = np.stack(
             [-0.5 * f * g * g, f * f * (1.5 * f - 2.5) + 1.0, g * g * (1.5 * g - 2.5) + 1.0, -0.5 * g * f * f], axis=-1
         )
-        rows = (np.arange(visits)[:, None] * (suns + 2) + s)[..., None] + np.arange(4)
-        sample = np.broadcast_to(np.arange(samples)[:, None], rows.shape)
+        of_suns = np.clip(s[..., None] + np.arange(4) - skipped, 0, count - 1)
+        first, size = visits.rows(count), visits.groups * visits.together * count
+        rows = first[:, None, None] + of_suns * visits.together
+        sample = np.broadcast_to(np.arange(x.shape[1])[:, None], rows.shape)
         read = weights != 0.0
         rows, weights, sample = rows[read], weights[read], sample[read]
         order = np.argsort(rows, kind="stable")
         self.table = floats(np.column_stack([sample[order], weights[order]]))
-        self.first = uints(np.searchsorted(rows[order], np.arange(visits * (suns + 2) + 1)))
+        self.first = uints(np.searchsorted(rows[order], np.arange(size + 1)))
+        visit = np.zeros(size, int)
+        visit[first[:, None] + np.arange(count) * visits.together] = np.arange(len(first))[:, None]
+        self.visit = uints(visit)
 
 
 def by_table(
-    readers: Readers,
-    paths: Paths,
-    place: Any,
-    scale: Any,
-    grad: Any,
-    samples: int,
-    suns: int,
-    orders: int,
-    channels: int,
+    readers: Readers, paths: Paths, place: Any, scale: Any, grad: Any, samples: int, orders: int, channels: int
 ) -> Any:
-    """Derivative by the table that Gather reads, [visits, suns + 2, m x channels], from ``grad`` [rays, samples, 4] by
-    radiance; ``place`` and ``scale`` are those of gather.Samples and Gather."""
+    """Derivative by the table that Gather reads (gather.contracted), from ``grad`` [rays, samples, 4] by radiance;
+    ``place`` and ``scale`` are those of gather.Samples and Gather."""
     t, visits = types(), len(paths.station)
     lane = dr.arange(t.UInt, visits * samples)
     visit = lane // samples
@@ -164,8 +182,8 @@ def by_table(
     values = [a * b for a, b in zip(*parts, strict=True)][:channels]
     scaled = table_of([packet(place, lane, 2)[1], *values], lane)
 
-    lane = dr.arange(t.UInt, visits * (suns + 2))
-    first = lane // (suns + 2) * samples
+    lane = dr.arange(t.UInt, dr.width(readers.visit))
+    first = readers.visit * samples
     start, stop = (dr.gather(t.UInt, readers.first, lane + i) for i in (0, 1))
 
     def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
@@ -173,10 +191,6 @@ def by_table(
         cos_phi, *values = row(scaled, first + t.UInt(sample), channels + 1)
         return i + 1, add_harmonics(sums, [weight * value for value in values], cos_phi)
 
-    return _summed(add, start, stop, orders * channels, lane)
-
-
-def _summed(add: Callable[..., Any], start: Any, stop: Any, width: int, lane: Any) -> Any:
-    zero = [dr.zeros(types().Float, dr.width(lane)) for _ in range(width)]
+    zero = [dr.zeros(t.Float, dr.width(lane)) for _ in range(orders * channels)]
     _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
     return table_of(sums, lane)

@@ -10,12 +10,13 @@ from atmo_jit.gather import Samples, contracted, interpolated
 from atmo_jit.grid import Grid
 from atmo_jit.paths import directions_at
 from atmo_jit.resolution import Resolution
+from atmo_jit.visits import Visits
 
 from .tolerances import ADJOINT
 
 RESOLUTION = Resolution()
 ORDERS, CHANNELS, DEGREE, AZIMUTHS = 3, 3, 4, 6
-WIDTH = 16  # rows of ORDERS x CHANNELS floats load in packets of 8
+ROW = {ORDERS * CHANNELS: 16, CHANNELS: 4}  # floats for which a row of a table has room
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +42,9 @@ def both_ways(function, values, seed):
     return np.vdot(light, weights), np.vdot(values.astype(float), adjoint), size
 
 
-def filled(rng, *shape):
-    values = rng.normal(size=(*shape, WIDTH)).astype(np.float32)
-    values[..., ORDERS * CHANNELS :] = 0.0  # what fills a row up
+def filled(rng, *shape, width=ORDERS * CHANNELS):
+    values = rng.normal(size=(*shape, ROW[width])).astype(np.float32)
+    values[..., width:] = 0.0  # what fills a row up
     return values
 
 
@@ -55,7 +56,7 @@ def test_moments_seen_along_paths(samples, number, suns, degree):
     paths = samples.paths
     rng = np.random.default_rng(1)
     levels = int(paths.level.max()) + 1
-    inputs = [filled(rng, levels, suns, degree + 2), filled(rng, len(paths.station), degree + 2)]
+    inputs = [filled(rng, levels, suns, degree + 2), filled(rng, len(paths.station), degree + 2, width=CHANNELS)]
 
     def seen(leaf):
         given = [floats(v) for v in inputs]
@@ -67,10 +68,10 @@ def test_moments_seen_along_paths(samples, number, suns, degree):
 
 
 def test_radiance_of_a_table(samples):
-    """By the table [visits, suns + 2, m x channels] that radiance is interpolated in."""
-    rng, visits = np.random.default_rng(3), len(samples.paths.station)
-    scale = rng.random((visits, samples.per_visit, 4)).astype(np.float32)
-    table = filled(rng, visits, samples.suns + 2)
+    """By the table [visits, suns + 1, m x channels] that radiance is interpolated in."""
+    rng, visits = np.random.default_rng(3), Visits.of(samples.paths, ORDERS * CHANNELS)
+    scale = rng.random((len(visits.place), samples.per_visit, 4)).astype(np.float32)
+    table = filled(rng, visits.groups * visits.together, samples.suns + 1)
     forwards, backwards, size = both_ways(
         lambda leaf: interpolated(samples, floats(scale), leaf, ORDERS, CHANNELS), table, 4
     )
