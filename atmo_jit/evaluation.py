@@ -14,7 +14,7 @@ from .backend import doubles, evaluated, traversing, types
 from .batches import Batches
 from .parameters import VIEWS
 from .profile_tangents import few_numbers
-from .recording import Recordings, copied
+from .recording import Recordings, copied, give_back
 from .solved import Sky
 
 OUTPUTS = ("radiance", "transmittance", "sun_irradiance", "sky_irradiance")
@@ -133,6 +133,7 @@ class Evaluation:
                 ("reverse", *key), of_field, values, views, pieces, small, weights
             )
             by_views = [by_views]
+            self._between()
         else:
             look_ups, notes = self._run("tables", tables_of, values, small)
             bare, sums, by_views = [{"columns": band["columns"]} for band in solved], None, []
@@ -142,6 +143,7 @@ class Evaluation:
                 by_views.append(part)
                 sums = [*more, by_tables] if sums is None else _sum(sums, [*more, by_tables])
                 dr.eval(sums)
+            self._between()
             if of_values:
                 found, tables, by_tables = sums
                 *more, first, later = self._run(("field", *of_values), of_tables, values, small, notes, by_tables)
@@ -151,6 +153,7 @@ class Evaluation:
             if flat(later):
                 *more, again = self._run(("later", *of_values), of_later, values, solved, later)
                 sums, first = _sum(sums, more), _sum(first, again)
+                self._between()
             small = [{**band, "known": {"of_first": band["known"]["of_first"]}} for band in solved]
             found, tables = _sum(sums, list(self._run(("first", *of_values), of_first, values, small, first)))
             if by_columns:
@@ -166,6 +169,12 @@ class Evaluation:
     def _run(self, key: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         with traversing():
             return self._recordings.run(key, function, *arguments) if self._recorded else function(*arguments)
+
+    def _between(self) -> None:
+        """What the arrays of a fine solve took is not kept for the next recording: it is much, and arrays there are of
+        other sizes."""
+        if self._sky.resolution.twice:
+            give_back()
 
     def _outputs(
         self, sky: Sky, views: dict[str, Any], pieces: list[Any], wanted: Collection[str] = OUTPUTS

@@ -5,6 +5,7 @@ A solve is a hundred small kernels, and tracing them costs more than running the
 
 from __future__ import annotations
 
+import ctypes
 import gc
 from collections.abc import Callable
 from typing import Any
@@ -34,9 +35,12 @@ class Recordings:
         if key not in self._used:
             self._used.add(key)
             if prepare is None:
-                return function(*arguments)
+                made = function(*arguments)
+                give_back()
+                return made
             prepare(*arguments)
-        if key not in self._recorded:
+        known = key in self._recorded
+        if not known:
             arrays = arrays_in(self._keepers)
             self._recorded[key] = dr.freeze(function, state_fn=lambda *_: arrays)
         # Dr.Jit aborts the process if an array that borrows NumPy's memory dies while it records, so the garbage
@@ -44,10 +48,23 @@ class Recordings:
         collects = gc.isenabled()
         gc.disable()
         try:
-            return self._recorded[key](*arguments)
+            made = self._recorded[key](*arguments)
         finally:
             if collects:
                 gc.enable()
+        if not known:
+            give_back()
+        return made
+
+
+def give_back() -> None:
+    """Give free memory back to the system: what Dr.Jit keeps for arrays to come, and what tracing and compiling left in
+    glibc's heap, half as much as all arrays of a solve and its derivatives."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def copied(tree: Any) -> Any:
