@@ -312,15 +312,13 @@ def sum_loop(
     return dr.while_loop(start, lambda *a: condition(*a[:-1]), turn, max_iterations=-1, label=label)[:-1]
 
 
-def set_row(table: Any, values: Sequence[Any], index: Any, active: Any = True) -> None:
-    """Write row ``index`` of a table of rows of as many ``values``, one lane a row; what fills it up is 0."""
+def set_rows(table: Any, rows: Sequence[Sequence[Any]], index: Any, active: Any = True) -> None:
+    """Write as many ``rows`` of a table as are given, side by side: the ``index``-th of such blocks, one a lane."""
     import drjit as dr
 
-    t, size = types(), row_size(len(values))
-    step, values = min(size, 8), [*values, *[t.Float(0.0)] * (size - len(values))]
-    for i in range(0, size, step):
-        part = t.ArrayXf(values[i : i + step]) if step > 1 else values[i]
-        dr.scatter(table, part, index * (size // step) + i // step, active)
+    t, fill = types(), row_size(len(rows[0])) - len(rows[0])
+    values = [value for values in rows for value in [*values, *[t.Float(0.0)] * fill]]
+    dr.scatter(table, t.ArrayXf(values) if len(values) > 1 else values[0], index, active)
 
 
 @contextmanager

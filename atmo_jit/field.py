@@ -20,13 +20,17 @@ from .backend import evaluated, floats, packet, padded, row, row_size, stored, t
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
-from .harmonics import Harmonics, pair_count, pairs, recurrence
+from .harmonics import Harmonics, pair_count, pair_index, pairs, recurrence
 from .look_ups import LookUps
 from .optics import Optics
 from .paths import lagrange
+from .phase import RayleighPhase
 from .refinement import Reference, Taps
 from .slopes import steep_nodes
 from .total import parity
+from .transposed import multilinear
+
+SMOOTH = 2  # degree of the phase function of air: beyond it only aerosols scatter
 
 
 class Field:
@@ -79,7 +83,7 @@ class Field:
         field = cls(optics, columns, grid, reference, degree, *[None] * 3, scatters=scatters)
         field.__dict__ |= {"_guide": tables["guide"], "_irradiances": tables["irradiances"]}
         if "moments" in tables:
-            field.__dict__["_refined_moments"] = tables["moments"]
+            field.__dict__["_refined_moments"] = list(tables["moments"])
         return field
 
     @property
@@ -99,17 +103,18 @@ class Field:
         reference = {f"reference.{name}": value for name, value in self.reference.held.items()}
         return {"moments": self.moments, "sky": self.sky, "reflected": self.reflected, **reference}
 
-    def _refined(self, values: Any, entries: int) -> Any:
-        """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically."""
+    def _refined(self, values: Any, degree: int | None = None) -> Any:
+        """[K, first suns, entries, channels] -> [levels, sources, entries, size], interpolated cubically. ``degree``:
+        of moments; None: one entry."""
         t, grid, channels = types(), self.grid, self.optics.channel_count
-        suns = len(grid.first_theta)
+        suns, entries = len(grid.first_theta), 1 if degree is None else pair_count(degree)
         row_length = suns * entries * channels
         values = _between_levels(grid, values, row_length)
         lane = dr.arange(t.UInt, grid.level_count * grid.sources * entries)
         entry, node = lane % entries, lane // entries
         source, level = node % grid.sources, node // grid.sources
         taps = Taps(grid, t.Float(source) * (grid.first / grid.sun_refine), suns)
-        sign = dr.gather(t.Float, parity(grid, self.degree), entry) if entries > 1 else 1.0
+        sign = 1.0 if degree is None else dr.gather(t.Float, parity(grid, degree), entry)
         places = [level * row_length + (at * entries + entry) * channels for at in taps.at]
         return stored(
             [taps.sum([dr.gather(t.Float, values, place + c) for place in places], sign) for c in range(channels)],
@@ -125,26 +130,55 @@ class Field:
         dr.eval(self._irradiances, self._guide)
 
     @cached_property
-    def _tables(self) -> tuple[Any, Any, Any]:
-        """Moments at refined suns for look-ups, the phase moments of every pair, and the recurrence of harmonics."""
-        width = len(self.optics.scatterers) * self.optics.channel_count
-
-        def steps() -> tuple[Any, Any]:
-            l_, m = pairs(self.degree)
-            rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(self.degree), l_, m, strict=True)]
-            size = row_size(width)
-            return table(np.pad(rows, ((0, -len(rows) % 8), (0, 0)))), uints(l_[:, None] * size + np.arange(size))
-
-        recurrences, places = self.grid.kept(("recurrences", self.degree, width), steps)
-        return (
-            self._refined_moments,
-            evaluated(dr.gather(types().Float, self.optics.phase_moments(self.degree), places)),
-            recurrences,
-        )
+    def _groups(self) -> list[tuple[int, list[int]]]:
+        """Scatterers that are summed together, and up to which degree: phase functions of air end at SMOOTH."""
+        scatterers = enumerate(self.optics.scatterers)
+        smooth = [n for n, k in scatterers if isinstance(self.optics.constituents[k].phase, RayleighPhase)]
+        sharp = [n for n in range(len(self.optics.scatterers)) if n not in smooth]
+        if not smooth or not sharp or self.degree <= SMOOTH:
+            return [(self.degree, sorted(smooth + sharp))]
+        return [(self.degree, sharp), (SMOOTH, smooth)]
 
     @cached_property
-    def _refined_moments(self) -> Any:
-        return self._refined(self.moments, pair_count(self.degree))
+    def _tables(self) -> list[tuple[Any, Any, Any]]:
+        """Per group moments at refined suns for look-ups, the phase moments of every pair, and the recurrence of
+        harmonics."""
+        channels, all_kinds = self.optics.channel_count, len(self.optics.scatterers)
+        found = []
+        for (degree, kinds), moments in zip(self._groups, self._refined_moments, strict=True):
+
+            def steps(degree: int = degree, kinds: list[int] = kinds) -> tuple[Any, Any]:
+                l_, m = pairs(degree)
+                rows = [[*entry, float(a == b)] for entry, a, b in zip(recurrence(degree), l_, m, strict=True)]
+                columns = np.array([n * channels + c for n in kinds for c in range(channels)])
+                columns = np.pad(columns, (0, row_size(len(columns)) - len(columns)), mode="edge")
+                places = l_[:, None] * row_size(all_kinds * channels) + columns
+                return table(np.pad(rows, ((0, -len(rows) % 8), (0, 0)))), uints(places)
+
+            key = ("recurrences", degree, *kinds, all_kinds, channels)
+            recurrences, places = self.grid.kept(key, steps)
+            phases = dr.gather(types().Float, self.optics.phase_moments(self.degree), places)
+            found.append((moments, evaluated(phases), recurrences))
+        return found
+
+    @cached_property
+    def _refined_moments(self) -> list[Any]:
+        return [self._refined(self._up_to(degree), degree) for degree, _ in self._groups]
+
+    def _up_to(self, degree: int) -> Any:
+        """The moments up to a degree."""
+        if degree == self.degree:
+            return self.moments
+        t, channels = types(), self.optics.channel_count
+
+        def find() -> Any:
+            places = [pair_index(self.degree, l_, m) for l_, m in zip(*pairs(degree), strict=True)]
+            nodes = np.arange(self.grid.shape[0] * len(self.grid.first_theta))
+            rows = nodes[:, None] * pair_count(self.degree) + np.array(places)
+            return uints(rows[..., None] * channels + np.arange(channels))
+
+        place = self.grid.kept(("up to", self.degree, degree, channels), find)
+        return evaluated(dr.gather(t.Float, self.moments, place, mode=dr.ReduceMode.NoConflicts))
 
     @cached_property
     def _guide(self) -> Any:
@@ -157,11 +191,11 @@ class Field:
 
     @cached_property
     def _irradiances(self) -> tuple[Any, Any]:
-        return self._refined(self.sky, 1), self._refined(self.reflected, 1)
+        return self._refined(self.sky), self._refined(self.reflected)
 
     def refined_moments(self) -> np.ndarray:
         """Moments over the reference at the nodes of look-ups, float32 [levels x suns, pairs, channels]."""
-        moments = np.array(dr.detach(self._tables[0]), dtype=np.float32)
+        moments = np.array(dr.detach(self._refined_moments[0]), dtype=np.float32)
         moments = moments.reshape(-1, pair_count(self.degree), padded(self.optics.channel_count))
         return moments[..., : self.optics.channel_count]
 
@@ -210,39 +244,59 @@ class Field:
 
     def unclipped(self, h: Any, mu_s: Any, mu: Any, cos_phi: Any, active: Any) -> list[list[Any]]:
         """The same, below 0 where few moments cannot tell it from 0: a sum, whose derivatives do not ask what it is."""
-        t = types()
         channels, kinds = self.optics.channel_count, len(self.optics.scatterers)
         nodes, weights, scales = self.corners(h, mu_s, active)
         weights = [[w * scales[i // 2][c] for c in range(channels)] for i, w in enumerate(weights)]
         sine = safe_sine(mu)
         x = sine * cos_phi
         basis = Harmonics(dr.detach(mu), dr.detach(x), slopes=dr.grad_enabled(mu, cos_phi))
-        moments, phases, recurrences = self._tables
-        width = dr.width(h)
-        if dr.grad_enabled(moments, phases, weights) or basis.slopes:
-            look_ups = LookUps(self.grid, self.degree, channels, kinds, nodes[0], basis, recurrences, active)
-            total, slopes = look_ups(moments, phases, weights)
-            # Directions have no derivative in there; theirs follow from the slopes.
-            for step, of_step in zip((mu - basis.mu, x - basis.x), slopes, strict=False):
-                total = [dr.fma(step, slope, value) for slope, value in zip(of_step, total, strict=True)]
-        else:
-            stride = dr.opaque(t.UInt, pair_count(self.degree), 1)
-
-            def pair(i: Any, state: Any, sums: list[Any]) -> tuple[Any, ...]:
-                (value,), state = basis.next(packet(recurrences, i, 4, active), state)
-                corner = [packet(moments, node * stride + i, padded(channels), active) for node in nodes]
-                moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
-                chi = row(phases, i, kinds * channels, active=active)
-                light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
-                return i + 1, state, [dr.fma(value, part, s) for part, s in zip(light, sums, strict=True)]
-
-            sums = [dr.zeros(t.Float, width) for _ in range(kinds * channels)]
-            state = (t.UInt(0), basis.start(width), sums)
-            *_, total = dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")
+        width, total = dr.width(h), [None] * (kinds * channels)
+        before = None
+        for (degree, members), (moments, phases, recurrences) in zip(self._groups, self._tables, strict=True):
+            count = len(members)
+            if dr.grad_enabled(moments, phases, weights) or basis.slopes:
+                look_ups = LookUps(self.grid, degree, channels, count, nodes[0], basis, recurrences, active, before)
+                found, slopes = look_ups(moments, phases, weights)
+                before = before or look_ups
+                # Directions have no derivative in there; theirs follow from the slopes.
+                for step, of_step in zip((mu - basis.mu, x - basis.x), slopes, strict=False):
+                    found = [dr.fma(step, slope, value) for slope, value in zip(of_step, found, strict=True)]
+            else:
+                found = self._looked_up(degree, count, nodes, weights, basis, moments, phases, recurrences, active)
+            for i, n in enumerate(members):
+                total[n * channels : (n + 1) * channels] = found[i * channels : (i + 1) * channels]
         if self._steep(h, mu_s):
             total = [a + b for a, b in zip(total, self._moved(h, mu_s, basis, active), strict=True)]
         solar = self.optics.spread(width).solar
         return [[e * v for e, v in zip(solar, total[n * channels :], strict=False)] for n in range(kinds)]
+
+    def _looked_up(
+        self,
+        degree: int,
+        kinds: int,
+        nodes: list[Any],
+        weights: list[list[Any]],
+        basis: Harmonics,
+        moments: Any,
+        phases: Any,
+        recurrences: Any,
+        active: Any,
+    ) -> list[Any]:
+        """What look_ups.LookUps sums, without derivatives."""
+        t, channels, width = types(), self.optics.channel_count, dr.width(nodes[0])
+        stride = dr.opaque(t.UInt, pair_count(degree), 1)
+
+        def pair(i: Any, state: Any, sums: list[Any]) -> tuple[Any, ...]:
+            (value,), state = basis.next(packet(recurrences, i, 4, active), state)
+            corner = [packet(moments, node * stride + i, padded(channels), active) for node in nodes]
+            moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
+            chi = row(phases, i, kinds * channels, active=active)
+            light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
+            return i + 1, state, [dr.fma(value, part, s) for part, s in zip(light, sums, strict=True)]
+
+        sums = [dr.zeros(t.Float, width) for _ in range(kinds * channels)]
+        state = (t.UInt(0), basis.start(width), sums)
+        return dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")[-1]
 
     def _steep(self, h: Any, mu_s: Any) -> bool:
         """Whether derivatives by a place or sun, of a fine solve, pass through look-ups there."""
@@ -250,30 +304,50 @@ class Field:
 
     def _moved(self, h: Any, mu_s: Any, basis: Harmonics, active: Any) -> list[Any]:
         """0, with the derivatives of what ``unclipped`` sums by level and sun: [scatterer x channel]."""
-        t, channels, kinds = types(), self.optics.channel_count, len(self.optics.scatterers)
+        t, channels = types(), self.optics.channel_count
         moved, parts = steep_nodes(self.grid, self.reference, self._guide, h, mu_s, active)
-        total = [0.0] * (kinds * channels)
-        with dr.suspend_grad():
-            moments, phases, recurrences = (dr.detach(v) for v in self._tables)
-            basis, stride = Harmonics(basis.mu, basis.x, slopes=False), dr.opaque(t.UInt, pair_count(self.degree), 1)
-
-            def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
-                (value,), state = basis.next(packet(recurrences, i, 4, active), state)
-                chi = row(phases, i, kinds * channels, active=active)
-                new, size = [], padded(channels)
-                for (nodes, weights), old in zip(parts, sums, strict=True):
-                    corner = [packet(moments, node * stride + i, size, active, alone=True) for node in nodes]
-                    slope = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
-                    new.append([dr.fma(value, chi[n] * slope[n % channels], s) for n, s in enumerate(old)])
-                return i + 1, state, new
-
-            sums = [[dr.zeros(t.Float, dr.width(h)) for _ in total] for _ in parts]
-            state = (t.UInt(0), basis.start(dr.width(h)), sums)
-            *_, slopes = dr.while_loop(state, lambda i, *_: i < stride, pair, label="slopes")
-            dr.eval(slopes)
-        for step, of_step in zip(moved, slopes, strict=True):
-            total = [dr.fma(step, slope, value) for slope, value in zip(of_step, total, strict=True)]
+        total = [t.Float(0.0)] * (len(self.optics.scatterers) * channels)
+        basis = Harmonics(basis.mu, basis.x, slopes=False)
+        for (degree, members), tables in zip(self._groups, self._tables, strict=True):
+            with dr.suspend_grad():
+                flat = self._slopes(degree, len(members), parts, basis, *(dr.detach(v) for v in tables), active)
+            for step, of_step in zip(moved, flat, strict=True):
+                for i, n in enumerate(members):
+                    for c in range(channels):
+                        place = n * channels + c
+                        total[place] = dr.fma(step, of_step[i * channels + c], total[place])
         return total
+
+    def _slopes(
+        self,
+        degree: int,
+        kinds: int,
+        parts: list[tuple[list[Any], list[list[Any]]]],
+        basis: Harmonics,
+        moments: Any,
+        phases: Any,
+        recurrences: Any,
+        active: Any,
+    ) -> list[list[Any]]:
+        """The sums over pairs for each of the ``parts``, nodes and their weights, evaluated."""
+        t, channels, width = types(), self.optics.channel_count, dr.width(basis.mu)
+        stride = dr.opaque(t.UInt, pair_count(degree), 1)
+
+        def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
+            (value,), state = basis.next(packet(recurrences, i, 4, active), state)
+            chi = row(phases, i, kinds * channels, active=active)
+            new, size = [], padded(channels)
+            for (nodes, weights), old in zip(parts, sums, strict=True):
+                corner = [packet(moments, node * stride + i, size, active, alone=True) for node in nodes]
+                slope = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
+                new.append([dr.fma(value, chi[n] * slope[n % channels], s) for n, s in enumerate(old)])
+            return i + 1, state, new
+
+        sums = [[dr.zeros(t.Float, width) for _ in range(kinds * channels)] for _ in parts]
+        state = (t.UInt(0), basis.start(width), sums)
+        *_, slopes = dr.while_loop(state, lambda i, *_: i < stride, pair, label="slopes")
+        dr.eval(slopes)
+        return slopes
 
 
 def _blend(weights: list[Any], values: list[Any]) -> Any:
@@ -286,19 +360,40 @@ def _blend(weights: list[Any], values: list[Any]) -> Any:
 def _between_levels(grid: Grid, values: Any, length: int) -> Any:
     """[K, length] -> [levels, length]: by the polynomial in the altitude coordinate through four nodes, or six where
     derivatives are wanted."""
-    t, count = types(), min(6 if grid.resolution.twice else 4, grid.shape[0])
+    t, nodes = types(), grid.shape[0]
+    count = min(6 if grid.resolution.twice else 4, nodes)
 
-    def taps() -> tuple[Any, Any]:
+    def taps() -> tuple[Any, Any, Any]:
         level = np.arange(grid.level_count) / grid.refine
-        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, grid.shape[0] - count)
-        nodes = (first[:, None] + np.arange(count)).astype(float)
-        return uints(first), floats(lagrange(nodes, level))
+        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, nodes - count)
+        weights = lagrange((first[:, None] + np.arange(count)).astype(float), level)
+        # Levels that read a node are consecutive.
+        readers = np.searchsorted(first, [np.arange(nodes) - count + 1, np.arange(nodes) + 1])
+        return uints(first), floats(weights), uints(readers.T)
 
-    first, weights = grid.kept("between levels", taps)
-    lane = dr.arange(t.UInt, grid.level_count * length)
-    level, place = lane // length, lane % length
-    start, total = dr.gather(t.UInt, first, level), 0.0
-    for i in range(count):
-        value = dr.gather(t.Float, values, (start + i) * length + place)
-        total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
-    return evaluated(total)
+    first, weights, readers = grid.kept("between levels", taps)
+
+    def at_levels(values: Any) -> Any:
+        lane = dr.arange(t.UInt, grid.level_count * length)
+        level, place = lane // length, lane % length
+        start, total = dr.gather(t.UInt, first, level), 0.0
+        for i in range(count):
+            value = dr.gather(t.Float, values, (start + i) * length + place)
+            total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
+        return evaluated(total)
+
+    def transposed(grad: Any, *_: Any) -> Any:
+        lane = dr.arange(t.UInt, nodes * length)
+        node, place = lane // length, lane % length
+        start, stop = packet(readers, node, 2)
+
+        def add(level: Any, total: Any) -> tuple[Any, Any]:
+            weight = dr.gather(t.Float, weights, level * count + node - dr.gather(t.UInt, first, level))
+            return level + 1, dr.fma(weight, dr.gather(t.Float, grad, level * length + place), total)
+
+        state = start, dr.zeros(t.Float, dr.width(lane))
+        total = dr.while_loop(state, lambda level, _: level < stop, add, max_iterations=-1, label="between levels")[1]
+        dr.eval(total)
+        return total
+
+    return multilinear(at_levels, transposed, values)

@@ -30,7 +30,7 @@ from .paths import Directions, Paths, paths_along
 from .projection import Moments, add_harmonics, room, stored_harmonics
 from .quadrature import half_circle
 from .refinement import Reference
-from .transposed import Readers, by_moments, by_table, by_weights, multilinear
+from .transposed import Readers, by_moments, by_phase, by_table, by_weight, by_weights, multilinear
 from .visits import Visits, weighed
 
 FAINT = 1e-15  # light of which no quotient is made: a derivative has its square below the line
@@ -326,17 +326,29 @@ def weight_rows(optics: Optics, paths: Paths, scattered: Any, reflected: Any, de
     """What a moment counts at each visit beside its harmonic, table [visits, l, channels]: weight times phase moment;
     after the last l the ground's part of the irradiance (None: left out)."""
     t, channels, kinds = types(), optics.channel_count, len(optics.scatterers)
-    chi = optics.phase_moments(degree + 1)
-    lane = dr.arange(t.UInt, len(paths.station) * (degree + 2))
-    # Sizes are read from memory: one kernel for all of them.
-    size = dr.opaque(t.UInt, degree + 2, 1)
-    visit = lane // size
-    l_ = lane - visit * size
-    last = l_ == size - 1
-    values = [t.Float(0.0)] * channels
-    if kinds:
-        weight, moment = row(scattered, visit, kinds * channels), row(chi, l_, kinds * channels)
-        for n in range(kinds):
-            values = [dr.fma(weight[n * channels + c], moment[n * channels + c], values[c]) for c in range(channels)]
-    ground = row(reflected, visit, channels, active=last) if reflected is not None else [t.Float(0.0)] * channels
-    return table_of([dr.select(last, r, v) for r, v in zip(ground, values, strict=True)], lane)
+    rows, width = degree + 2, kinds * channels
+    if reflected is None:
+        reflected = dr.zeros(t.Float, len(paths.station) * row_size(channels))
+
+    def counted(scattered: Any, chi: Any, reflected: Any) -> Any:
+        lane = dr.arange(t.UInt, len(paths.station) * rows)
+        # Sizes are read from memory: one kernel for all of them.
+        size = dr.opaque(t.UInt, rows, 1)
+        visit = lane // size
+        l_ = lane - visit * size
+        last = l_ == size - 1
+        values = [t.Float(0.0)] * channels
+        if kinds:
+            for j, both in enumerate(zip(row(scattered, visit, width), row(chi, l_, width), strict=True)):
+                values[j % channels] = dr.fma(*both, values[j % channels])
+        ground = row(reflected, visit, channels, active=last)
+        return table_of([dr.select(last, r, v) for r, v in zip(ground, values, strict=True)], lane)
+
+    def transposed(grad: Any, number: int, scattered: Any, chi: Any, reflected: Any) -> Any:
+        sizes = len(paths.station), rows, channels, kinds
+        if number < 2:
+            return by_phase(grad, scattered, *sizes) if number else by_weight(grad, chi, *sizes)
+        visit = dr.arange(t.UInt, len(paths.station))
+        return table_of(row(grad, visit * dr.opaque(t.UInt, rows, 1) + (rows - 1), channels), visit)
+
+    return multilinear(counted, transposed, scattered, optics.phase_moments(degree + 1), reflected, alone=(2,))

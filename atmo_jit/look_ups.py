@@ -29,7 +29,7 @@ CORNERS = 4
 class LookUps:
     """Look-ups of moments [node, pair, channels] of a ``degree`` in cells of ``grid``, given by the first node of each,
     in the directions of ``basis``, which carries no derivative, by the recurrence with coefficients ``steps``. Where
-    they are not ``active`` they are 0."""
+    they are not ``active`` they are 0. ``same``: others in the same cells."""
 
     grid: Grid
     degree: int
@@ -39,6 +39,7 @@ class LookUps:
     basis: Harmonics
     steps: Any
     active: Any
+    same: LookUps | None = None
 
     def __call__(self, moments: Any, phases: Any, weights: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
         """Sums over pairs and corners of harmonic, phase moment, ``weights`` [corner][channel] and moment, [scatterer x
@@ -73,6 +74,8 @@ class LookUps:
 
         Those that are not active come last, as if in a cell of their own.
         """
+        if self.same is not None:
+            return self.same._by_cells
         t = types()
         cell = dr.select(self.active, self.cell, self._cells)
         counts = dr.zeros(t.UInt, self.grid.level_count * self.grid.sources + 1)

@@ -7,39 +7,50 @@ readers have for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from .backend import floats, packet, row, row_size, set_row, table_of, types, uints
+from .backend import floats, packet, row, row_size, set_rows, table_of, types, uints
 from .paths import Paths
 from .projection import add_harmonics
 from .visits import Visits, weighed
 
-SUNS, ROWS = 2, 2  # that a lane of by_moments takes
+SUNS = 2  # that a lane of by_moments takes
+LANES = 64  # that share the visits of a degree
 
 
-def multilinear(function: Callable[..., Any], transposed: Callable[..., list[Any]], *inputs: Any) -> Any:
+def multilinear(
+    function: Callable[..., Any], transposed: Callable[..., list[Any]], *inputs: Any, alone: Sequence[int] = ()
+) -> Any:
     """``function`` of Floats in each of which it is linear. ``transposed``: the derivative by one of them, given
-    that by the result, the number of the input, and the inputs."""
+    that by the result, the number of the input, and the inputs. ``alone``: those that are added to the product of the
+    others."""
     if not dr.grad_enabled(inputs):
         return function(*inputs)
     wanted = [dr.grad_enabled(value) for value in inputs]
-    return dr.custom(_Multilinear, list(inputs), function, transposed, wanted)
+    return dr.custom(_Multilinear, list(inputs), function, transposed, wanted, alone)
 
 
 class _Multilinear(dr.CustomOp):
-    def eval(self, inputs: list[Any], function: Any, transposed: Any, wanted: list[bool]) -> Any:
+    def eval(
+        self, inputs: list[Any], function: Any, transposed: Any, wanted: list[bool], alone: Sequence[int]
+    ) -> Any:
         self.inputs, self.function, self.transposed, self.wanted = list(inputs), function, transposed, wanted
+        self.alone = alone
         return function(*inputs)
 
     def forward(self) -> None:
         steps, total = self.grad_in("inputs"), 0.0
         for i in (i for i, wanted in enumerate(self.wanted) if wanted):
             dr.eval(steps[i])
-            total = total + self.function(*self.inputs[:i], steps[i], *self.inputs[i + 1 :])
+            given = [
+                value if (i in self.alone) == (j in self.alone) else dr.zeros(type(value), dr.width(value))
+                for j, value in enumerate(self.inputs)
+            ]
+            total = total + self.function(*given[:i], steps[i], *given[i + 1 :])
         dr.eval(total)
         self.set_grad_out(total)
 
@@ -65,34 +76,33 @@ def by_moments(
     of_levels = visits.first[np.minimum(np.arange(nodes + 1), len(visits.first) - 1)]
     first = visits.paths.kept(("groups at levels", together, nodes), lambda: uints(of_levels))
     # A lane takes some rows under some suns: what it reads for one of them serves the others.
-    some, few = (dr.opaque(t.UInt, n, 1) for n in (-(-suns // SUNS), -(-rows // ROWS)))
-    per_level, per_sun = dr.opaque(t.UInt, suns, 1), dr.opaque(t.UInt, rows, 1)
-    lane = dr.arange(t.UInt, nodes * -(-suns // SUNS) * -(-rows // ROWS))
+    beside = 1 + (rows % 2 == 0)
+    some, few, per_level = (dr.opaque(t.UInt, n, 1) for n in (-(-suns // SUNS), rows // beside, suns))
+    lane = dr.arange(t.UInt, nodes * -(-suns // SUNS) * (rows // beside))
     node = lane // few
-    row_, level = (lane - node * few) * ROWS, node // some
+    block, level = lane - node * few, node // some
     sun = (node - level * some) * SUNS
     start, stop = (dr.gather(t.UInt, first, level + i) * together for i in (0, 1))
-    suns_, rows_ = [sun + i for i in range(SUNS)], [row_ + i for i in range(ROWS)]
+    suns_ = [sun + i for i in range(SUNS)]
 
     def add(i: Any, sums: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
         member = i - i // together * together
         group = dr.gather(t.UInt, visits.at_levels, i // together)
         visit, place = dr.gather(t.UInt, visits.members, group * together + member), group * per_level
         come = [row(grad, (place + dr.minimum(at, per_level - 1)) * together + member, width) for at in suns_]
-        counts = [
-            weighed(basis, weights, visit * per_sun + dr.minimum(at, per_sun - 1), orders, channels) for at in rows_
-        ]
+        first_row = (visit * few + block) * beside
+        counts = [weighed(basis, weights, first_row + i, orders, channels) for i in range(beside)]
         both = [(one, other) for one in come for other in counts]
         return i + 1, [
             [dr.fma(a, b, s) for a, b, s in zip(*two, old, strict=True)] for two, old in zip(both, sums, strict=True)
         ]
 
-    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(SUNS * ROWS)]
+    zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(SUNS * beside)]
     _, sums = dr.while_loop((start, zero), lambda i, _: i < stop, add, max_iterations=-1, label="transposed")
     dr.eval(sums)  # each of the scatters would run the loop again
     found = dr.zeros(t.Float, nodes * suns * rows * row_size(width))
-    for values, (at, l_) in zip(sums, ((at, l_) for at in suns_ for l_ in rows_), strict=True):
-        set_row(found, values, (level * per_level + at) * per_sun + l_, (at < per_level) & (l_ < per_sun))
+    for i, at in enumerate(suns_):
+        set_rows(found, sums[i * beside : (i + 1) * beside], (level * per_level + at) * few + block, at < per_level)
     dr.eval(found)
     return found
 
@@ -118,21 +128,62 @@ def by_weights(
     zero = [[dr.zeros(t.Float, dr.width(lane)) for _ in range(width)] for _ in range(together * beside)]
     state = t.UInt(0), zero
     _, sums = dr.while_loop(state, lambda i, _: i < per_level, add, max_iterations=-1, label="transposed")
-    members = packet(visits.members, group, together)
-    places = [(visit * size + l_) * beside + i for visit in members for i in range(beside)]
+    places = [visit * size + l_ for visit in packet(visits.members, group, together)]
     counts = []
-    for place, values in zip(places, sums, strict=True):
-        harmonics = row(basis, place, orders)
+    for n, values in enumerate(sums):
+        harmonics = row(basis, places[n // beside] * beside + n % beside, orders)
         counts.append([_dot(harmonics, values[c::channels]) for c in range(channels)])
-    for i in range(beside, len(places)):  # of a visit that is there twice the last has it all
-        before = zip(counts[i], counts[i - beside], strict=True)
-        counts[i] = [a + dr.select(places[i] == places[i - beside], b, 0.0) for a, b in before]
+    for n in range(beside, len(counts)):  # of a visit that is there twice the last has it all
+        same = places[n // beside] == places[n // beside - 1]
+        before = zip(counts[n], counts[n - beside], strict=True)
+        counts[n] = [a + dr.select(same, b, 0.0) for a, b in before]
     dr.eval(counts)
     found = dr.zeros(t.Float, len(visits.place) * rows * row_size(channels))
-    for place, values in zip(places, counts, strict=True):
-        set_row(found, values, place)
+    for i, place in enumerate(places):
+        set_rows(found, counts[i * beside : (i + 1) * beside], place)
     dr.eval(found)
     return found
+
+
+def by_weight(grad: Any, chi: Any, visits: int, rows: int, channels: int, kinds: int) -> Any:
+    """Derivative by the weights of gather.weight_rows, table [visits, scatterer x channel], given that by the table
+    [visits, l, channels] that it makes: sums over l of that times the phase moments ``chi``."""
+    t, width = types(), kinds * channels
+    visit, end = dr.arange(t.UInt, visits), dr.opaque(t.UInt, rows - 1, 1)
+
+    def add(l_: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        come, moments = row(grad, visit * (end + 1) + l_, channels), row(chi, l_, width)
+        return l_ + 1, [dr.fma(come[j % channels], moments[j], s) for j, s in enumerate(sums)]
+
+    state = t.UInt(0), [dr.zeros(t.Float, visits) for _ in range(width)]
+    _, sums = dr.while_loop(state, lambda l_, _: l_ < end, add, max_iterations=-1, label="by weight")
+    return table_of(sums, visit)
+
+
+def by_phase(grad: Any, scattered: Any, visits: int, rows: int, channels: int, kinds: int) -> Any:
+    """The same by the phase moments, table [l, scatterer x channel]: sums over visits, some of them in a lane."""
+    t, width, some = types(), kinds * channels, -(-visits // LANES)
+    lane, size, end = dr.arange(t.UInt, rows * LANES), dr.opaque(t.UInt, rows, 1), dr.opaque(t.UInt, visits, 1)
+    part = lane // size
+    l_, start = lane - part * size, part * dr.opaque(t.UInt, some, 1)
+    stop = dr.minimum(start + dr.opaque(t.UInt, some, 1), end)
+
+    def add(visit: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        come, weights = row(grad, visit * size + l_, channels), row(scattered, visit, width)
+        return visit + 1, [dr.fma(come[j % channels], weights[j], s) for j, s in enumerate(sums)]
+
+    state = start, [dr.zeros(t.Float, dr.width(lane)) for _ in range(width)]
+    _, sums = dr.while_loop(state, lambda visit, _: visit < stop, add, max_iterations=-1, label="by phase")
+    parts = table_of(sums, lane)
+    row_ = dr.arange(t.UInt, rows)
+
+    def together(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+        return i + 1, [a + b for a, b in zip(row(parts, i * size + row_, width), sums, strict=True)]
+
+    state, count = (t.UInt(0), [dr.zeros(t.Float, rows) for _ in range(width)]), dr.opaque(t.UInt, LANES, 1)
+    _, sums = dr.while_loop(state, lambda i, _: i < count, together, max_iterations=-1, label="by phase")
+    # After the last degree comes the ground.
+    return table_of([dr.select(row_ < size - 1, s, 0.0) for s in sums], row_)
 
 
 def _dot(a: list[Any], b: list[Any]) -> Any:

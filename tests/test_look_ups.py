@@ -51,9 +51,9 @@ def test_both_ways(field, small):
     """<J v, w> = <v, J' w> by moments, phase moments and weights of corners, and J v is the change along v."""
     t, rng = types(), np.random.default_rng(1)
     altitude, sun, mu, cos_phi = places(field, 1)
-    moments, phases, recurrences = (dr.detach(v) for v in field._tables)
+    moments, phases, recurrences = (dr.detach(v) for v in field._tables[0])
     nodes, weights, _ = field.corners(altitude, sun, True)
-    cells, (channels, kinds) = t.UInt(nodes[0]), (field.optics.channel_count, len(field.optics.scatterers))
+    cells, (channels, kinds) = t.UInt(nodes[0]), (field.optics.channel_count, len(field._groups[0][1]))
     weights = [[t.Float(w) for _ in range(channels)] for w in weights]
     active = t.Bool(np.arange(COUNT) % 5 > 0)
 
