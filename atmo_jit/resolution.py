@@ -26,7 +26,8 @@ NEAR_GROUND = 1.0  # see Resolution.near_ground
 FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 # More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
 FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 20
-FINE_NEAR_GROUND, FINE_TWILIGHT, FINE_ORDERS = 2.0, 8.0, 2  # see Resolution; azimuthal orders more
+FINE_NEAR_GROUND, FINE_TWILIGHT, FINE_ORDERS = 3.0, 8.0, 2  # see Resolution; azimuthal orders more
+FINE_DIRECTIONS = 14  # at least, to either side of the horizon, less 2 below it
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -121,7 +122,7 @@ class Resolution:
         if fine:
             needed = max(first + FINE_DEGREES, FINE_TIMES * first)
             first = next((degree for degree in FIRST_DEGREES if degree >= needed), FIRST_DEGREES[-1])
-            up = max(10, 2 * first // 3)
+            up = max(FINE_DIRECTIONS, 2 * first // 3)
             most = stages[0].most + FINE_ORDERS
             stages = [replace(stages[0], degree=first, most=most, azimuths=most + 1, up=up, down=up - 2)]
             altitudes += FINE_ALTITUDES

@@ -29,7 +29,8 @@ def test_fine_derivatives_are_those_of_more_nodes():
 
 
 def test_the_table_has_both_parts():
-    errors = np.array([[1e-4, 2e-3, 5e-3, 2e-2], [1e-5, 1e-5, 1e-5, 1e-5], [0.0, 0.0, 1.0, 1.0]])
+    errors = np.array([[1e-4, 2e-3, 5e-3, 2e-2], [1e-5, 1e-5, 1e-5, 1e-5], [0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 1.0, 1.0]])
     rows = [line for line in table({"ground_albedo": errors}).splitlines() if "ground_albedo" in line]
     assert len(rows) == 2
-    assert all("| 50% |" in row for row in rows)
+    assert ["50% | 100% |" in row for row in rows] == [True, False]
+    assert "50% | 50% |" in rows[1]
