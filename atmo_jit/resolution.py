@@ -28,6 +28,8 @@ FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 20
 FINE_NEAR_GROUND, FINE_TWILIGHT, FINE_ORDERS = 3.0, 8.0, 2  # see Resolution; azimuthal orders more
 FINE_DIRECTIONS = 14  # at least, to either side of the horizon, less 2 below it
+# Optical depth of aerosols up to which light that meets them twice needs no more, where there are more than a few.
+CLEAR, FEW_ORDERS = 0.025, 4
 REMEMBERED = 64  # phase functions whose moments are kept
 REACH_DEGREE = 40  # of the moments that are kept, unless more are asked for
 
@@ -101,8 +103,9 @@ class Resolution:
         Degrees follow from how fast the moments of the phase functions fade, weighed by how much of the light those
         particles scatter. ``fine``: the one whose derivatives are within the tolerance too. That of g^l, l g^(l - 1),
         fades later, and the derivative of an order's moments beyond its degrees is not that of order 1's; so all
-        orders have all degrees, and two azimuthal orders more. Altitudes are denser near the ground and where air only
-        absorbs, suns at twilight, look-ups have twice as many levels, and rays ask for the field twice a piece.
+        orders have all degrees, and two azimuthal orders more, but for orders above 2 where aerosols are thin.
+        Altitudes are denser near the ground and where air only absorbs, suns at twilight, look-ups have twice as many
+        levels, and rays ask for the field twice a piece.
         ``air_mass``: of the longest view and of the lowest sun, for a sky of which only that is asked: high views need
         fewer degrees.
         """
@@ -125,6 +128,8 @@ class Resolution:
             up = max(FINE_DIRECTIONS, 2 * first // 3)
             most = stages[0].most + FINE_ORDERS
             stages = [replace(stages[0], degree=first, most=most, azimuths=most + 1, up=up, down=up - 2)]
+            if most > FEW_ORDERS and _haze(atmosphere) < CLEAR:
+                stages.append(replace(stages[0], most=most - FINE_ORDERS, azimuths=most - FINE_ORDERS + 1))
             altitudes += FINE_ALTITUDES
         return cls(
             altitudes=_altitudes(atmosphere, altitudes, thick, deep),
@@ -148,6 +153,12 @@ class Resolution:
             # As many as the azimuths tell apart when what they see is projected on the first ones.
             phase_degree=max(16, first + 8),
         )
+
+
+def _haze(atmosphere: Atmosphere) -> float:
+    """Vertical optical depth that scatters in aerosols, the largest of all wavelengths."""
+    depths = (c.scattering_per_m * column_of(atmosphere, c) for c in atmosphere.mie)
+    return float(np.max(sum(depths, start=np.zeros(1))))
 
 
 def _columns(atmosphere: Atmosphere, fine: bool) -> tuple[int, int]:
