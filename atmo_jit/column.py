@@ -9,8 +9,10 @@ finite and smooth up to the top, where both vanish, and constant in mu for a fla
 
 Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends.
 Just below a kink a horizontal ray's column has a root, sqrt(h_break - h), and an oblique one's a line: rows lie at
-h_break - width x^2, and profiles with kinks are interpolated linearly in the distance to the break, which is exact for
-both. Exponential profiles have no kinks; the logarithm of their mean is interpolated linearly in h.
+h_break - width x^2, and profiles with kinks are interpolated linearly in the distance s to the break, which is exact for
+both. Where density changes linearly by q per metre of depth below the break, with r its radius, the column of the shell
+is a cubic, rho s + q (mu s^2 / 2 + s^3 / 3r): its divided difference is what a line lacks. Exponential profiles have no
+kinks; the logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from .grid import Grid
 from .kept import Keeper
 from .levels import thinnest
 from .optics import Optics
-from .profile import Exponential
+from .profile import Exponential, Tabulated
 from .profile_tangents import Part, few_numbers, tangents
 from .quadrature import gauss_legendre
 
@@ -50,6 +52,8 @@ class SunColumns:
         self.optics = optics
         self._count = len(optics.constituents)
         self._logarithmic = [isinstance(c.profile, Exponential) for c in optics.constituents]
+        # Behind them in a row of the table: how density changes with depth, where that is worth a correction.
+        self._sloping = [k for k, c in enumerate(optics.constituents) if isinstance(c.profile, Tabulated)]
         atmosphere, breaks = optics.atmosphere, optics.breaks_m
         knee = 0.7 * np.sqrt(2.0 * thinnest(atmosphere) / atmosphere.bottom_radius_m)
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
@@ -75,6 +79,11 @@ class SunColumns:
         other.table = table if table is not None else other._build(known) if self._count else None
         return other
 
+    @property
+    def _row(self) -> int:
+        """Numbers in a row of the table."""
+        return self._count + len(self._sloping)
+
     def _build(self, known: Any = None) -> Any:
         """The table. ``known``: its numbers; then only derivatives are made."""
         t = types()
@@ -91,18 +100,20 @@ class SunColumns:
         at_top = self.optics.densities(dr.fma(low - high, dr.maximum(x, 1e-3) ** 2, high))
         per_path = dr.select(path > 0.0, 1.0 / dr.select(path > 0.0, path, 1.0), 0.0)
         means = [dr.select(path > 0.0, total * per_path, top) for total, top in zip(totals, at_top, strict=True)]
+        upper, lower = (self.optics.densities(dr.fma(low - high, part, high)) for part in (0.25, 0.75))
+        grows = [2.0 * (lower[k] - upper[k]) / (high - low) for k in self._sloping]
         if known is None:
             flags = zip(means, self._logarithmic, strict=True)
             means = [dr.log(dr.maximum(mean, LEAST)) if log else mean for mean, log in flags]
-            return table_of(means, lane)
+            return table_of([*means, *grows], lane)
         # The derivative of a logarithm needs its number alone: the integral is not computed again.
-        logs = row(known, lane, self._count)
+        logs = row(known, lane, self._count, self._row)
         slopes = [
             dr.select(v > np.log(2.0 * LEAST), dr.exp(-v), 0.0) if log else 1.0
             for v, log in zip(logs, self._logarithmic, strict=True)
         ]
         with noted.knowing([known]):
-            return table_of([slope * mean for slope, mean in zip(slopes, means, strict=True)], lane)
+            return table_of([*(slope * mean for slope, mean in zip(slopes, means, strict=True)), *grows], lane)
 
     def following(self, optics: Optics, keeper: Keeper) -> SunColumns:
         """The same for optics whose profiles, of few numbers, carry derivatives: look-ups then do. ``keeper``, which is
@@ -177,15 +188,22 @@ class SunColumns:
             by_distance = by_altitude * ((farther + nearer) / above)
             # Columns, not means, are linear: the paths to the top of the rows. Roots are large beside their difference.
             step = dr.sqrt(2.0 * r / per_width) * (dr.fma(2.0, start, 1.0) / self._rows)
+            sums = here + nearer + farther
             nearer = dr.maximum(dr.fma(-step, by_altitude / above, path), 0.0)
             farther = dr.fma(step, (1.0 - by_altitude) / beneath, path)
-        near, far = rows(self.table, self._count)
+            # mu / 2 + (s_i + s + s_j) / 3r, times (s - s_i) (s_j - s).
+            turn = sums * dr.sqrt(2.0 / (9.0 * r * per_width)) / self._rows
+            lacking = (turn - 0.5 * mu) * step * step * by_altitude * (1.0 - by_altitude) / (above * beneath)
+        near, far = rows(self.table, self._row)
         result = []
         for k in range(self._count):
             if self._logarithmic[k]:
                 result.append(dr.exp(dr.lerp(near[k], far[k], by_altitude)) * path)
             else:
-                result.append(dr.lerp(near[k] * nearer, far[k] * farther, by_distance))
+                column = dr.lerp(near[k] * nearer, far[k] * farther, by_distance)
+                if k in self._sloping:
+                    column -= near[self._count + self._sloping.index(k)] * lacking
+                result.append(dr.maximum(column, 0.0))
         numbers = flat((optics or self.optics).profiles)
         if self._tangents is None or not dr.grad_enabled(numbers):
             return result
