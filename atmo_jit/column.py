@@ -37,6 +37,7 @@ from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
 LEAST = 1e-37  # mean density of which a logarithm is made
+LEAST_ROWS = 24  # in a shell, where densities are tabulated: what is above a step is steep in its light
 _CELLS = 4096  # of the look-up from altitude to shell, uniform in the square root of altitude
 
 
@@ -59,10 +60,13 @@ class SunColumns:
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
         # Intervals per shell. It and their number are parameters: where a level more is cut no kernel is compiled.
-        self._intervals = max(4, round(size[0] / self._shells))
+        self._intervals = max(LEAST_ROWS if self._sloping else 4, round(size[0] / self._shells))
         self._rows, self._last = parameter(self._intervals), parameter(self._shells - 1.0)
         edges = np.sqrt(breaks / atmosphere.thickness_m) * _CELLS
         cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
+        # Mostly one shell at most begins inside a cell; under a step of density there may be several.
+        several = int(np.max(np.diff(cell_start))) - 1
+        self._steps = [1 << i for i in reversed(range(max(several, 0).bit_length()))]
         # Low, high, 1 / width and number of every shell, and of the shell at the start of every cell.
         bounds = np.column_stack([breaks[:-1], breaks[1:], 1.0 / np.diff(breaks), np.arange(self._shells)])
         self._bounds, self._cells = floats(bounds), floats(bounds[np.clip(cell_start, 0, self._shells - 1)])
@@ -156,6 +160,9 @@ class SunColumns:
         position = dr.safe_sqrt(dr.clip(h * self._per_metre, 0.0, 1.0)) * _CELLS
         _, high, _, shell = packet(self._cells, dr.minimum(t.UInt(position), _CELLS), 4, active)
         shell = t.UInt(dr.minimum(dr.select(h >= high, shell + 1.0, shell), self._last))
+        for step in self._steps:
+            farther = dr.minimum(shell + step, t.UInt(self._last))
+            shell = dr.select(h >= dr.gather(t.Float, self._bounds, 4 * farther, active), farther, shell)
         _, high, per_width, _ = packet(self._bounds, shell, 4, active)
         depth = dr.clip((high - h) * per_width, 0.0, 1.0)
         y = dr.safe_sqrt(depth) * self._rows

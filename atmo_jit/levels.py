@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .atmosphere import Atmosphere
+from .atmosphere import Atmosphere, Constituent
 from .profile import Exponential, Tabulated, Tent
 
 FEW_CORNERS = 8
@@ -15,6 +15,8 @@ FEW_CORNERS = 8
 LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
 # In fog, more: as long as a horizontal ray there has this optical depth.
 FURTHER, THIN = 4.0, 0.05
+# And where nothing else scatters, as long as anything does: this horizontal optical depth, and share of what scatters.
+NOTHING, ALONE = 1e-9, 0.1
 RAMP, THICK = 0.25, 4.0
 STEEPER = 4.0
 FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
@@ -31,6 +33,7 @@ def breaks(atmosphere: Atmosphere) -> np.ndarray:
         extinction = float(np.max(c.extinction_per_m))
         if isinstance(c.profile, Exponential):
             levels += _scale_height_levels(c.profile.scale_height_m, extinction, radius, top)
+            levels += _levels_above(atmosphere, c, levels[-1])
         else:
             kinks.update(_ramp_levels(c.profile, extinction, radius))
             kinks.update(_under_steps(c, radius))
@@ -91,6 +94,21 @@ def _scale_height_levels(height: float, extinction: float, radius: float, top: f
     horizontal = extinction * np.sqrt(2.0 * np.pi * (radius + top) * height)
     while levels[-1] < top and horizontal * np.exp(-levels[-1] / height) > THIN:
         levels.append(levels[-1] + FURTHER * height)
+    return levels
+
+
+def _levels_above(atmosphere: Atmosphere, c: Constituent, level: float) -> list[float]:
+    """Altitudes (m) beyond the ``level`` up to which an exponential profile is cut, for views of what is left there."""
+    scattering, height = float(np.max(c.scattering_per_m)), c.profile.scale_height_m
+    horizontal = np.sqrt(2.0 * np.pi * (atmosphere.bottom_radius_m + atmosphere.thickness_m) * height)
+    levels: list[float] = []
+    while level < atmosphere.thickness_m:
+        own = scattering * np.exp(-level / height)
+        everything = sum(float(np.max(o.scattering_per_m) * o.profile.density(level)) for o in atmosphere.constituents)
+        if horizontal * own < NOTHING or own < ALONE * everything:
+            break
+        level += FURTHER * height
+        levels.append(level)
     return levels
 
 
