@@ -9,10 +9,10 @@ finite and smooth up to the top, where both vanish, and constant in mu for a fla
 
 Rows are altitudes, some in every shell between two breaks of the profiles, with rows of their own at both its ends.
 Just below a kink a horizontal ray's column has a root, sqrt(h_break - h), and an oblique one's a line: rows lie at
-h_break - width x^2, and profiles with kinks are interpolated linearly in the distance s to the break, which is exact for
-both. Where density changes linearly by q per metre of depth below the break, with r its radius, the column of the shell
-is a cubic, rho s + q (mu s^2 / 2 + s^3 / 3r): its divided difference is what a line lacks. Exponential profiles have no
-kinks; the logarithm of their mean is interpolated linearly in h.
+h_break - width x^2, and profiles with kinks are interpolated linearly in the distance s to the break, exact for both.
+Where density changes linearly, by q per metre of depth below a break of radius r, the column of the shell is a cubic,
+rho s + q (mu s^2 / 2 + s^3 / 3r): its divided difference is what a line lacks. Exponential profiles have no kinks; the
+logarithm of their mean is interpolated linearly in h.
 """
 
 from __future__ import annotations

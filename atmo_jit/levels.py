@@ -18,6 +18,10 @@ FURTHER, THIN = 4.0, 0.05
 # And where nothing else scatters, as long as anything does: this horizontal optical depth, and share of what scatters.
 NOTHING, ALONE = 1e-9, 0.1
 RAMP, THICK = 0.25, 4.0
+# The sun rises out of fog while a beam that grazes it has these optical depths: sudden where fog is so thin, of radii.
+DUSK, SUDDEN = (20.0, 5.0, 1.25, 0.3, 0.07, 0.015), 1.5e-4
+# While the sun's centre is down its light grazes the ground, and near that changes as the root of the altitude.
+NEAR_GROUND = (0.004, 0.02, 0.1)  # scale heights
 STEEPER = 4.0
 FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
 
@@ -34,6 +38,8 @@ def breaks(atmosphere: Atmosphere) -> np.ndarray:
         if isinstance(c.profile, Exponential):
             levels += _scale_height_levels(c.profile.scale_height_m, extinction, radius, top)
             levels += _levels_above(atmosphere, c, levels[-1])
+            if atmosphere.sun_angular_radius_deg > 0.0 and _grazing(atmosphere, c) > DUSK[2]:
+                levels += [part * c.profile.scale_height_m for part in NEAR_GROUND]
         else:
             kinks.update(_ramp_levels(c.profile, extinction, radius))
             kinks.update(_under_steps(c, radius))
@@ -80,6 +86,24 @@ def corners(atmosphere: Atmosphere) -> list[float]:
         if isinstance(profile, Tabulated):
             kinks.update(profile.kinks_m if len(profile.kinks_m) <= FEW_CORNERS else profile.steps_m)
     return [0.0, *sorted(k for k in kinks if 0.0 < k < top), top]
+
+
+def dusk(atmosphere: Atmosphere) -> list[float]:
+    """Altitudes (m) of the perigees of sunbeams between which their light changes smoothly, where fog that is thin
+    beside the planet hides the sun before the ground does."""
+    levels: set[float] = set()
+    for c in atmosphere.constituents:
+        grazing = _grazing(atmosphere, c)
+        levels.update(c.profile.scale_height_m * float(np.log(grazing / depth)) for depth in DUSK if grazing > depth)
+    return sorted(level for level in levels if level < atmosphere.thickness_m)
+
+
+def _grazing(atmosphere: Atmosphere, c: Constituent) -> float:
+    """Optical depth of a beam that grazes the ground through fog that is thin beside the planet; 0 of anything else."""
+    radius = atmosphere.bottom_radius_m
+    if not isinstance(c.profile, Exponential) or c.profile.scale_height_m > SUDDEN * radius:
+        return 0.0
+    return float(np.max(c.extinction_per_m) * np.sqrt(2.0 * np.pi * radius * c.profile.scale_height_m))
 
 
 def has_steps(atmosphere: Atmosphere) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from .backend import floats, packet, parameter, row, table_of, types
 from .column import SunColumns
 from .geometry import UPRIGHT, altitude_along, distance_down, distance_up, hits_ground, perigee_altitude, safe_sine
-from .levels import corners, has_steps
+from .levels import corners, dusk, has_steps
 from .optics import Optics
 from .quadrature import gauss_legendre, running_integral
 
@@ -113,9 +113,10 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
 
     The perigee of the sunbeam through a point lies at altitude k where h (2R + h) - (r mu_s)^2 = k (2R + k): along a
     ray a quadratic in the distance, the cylinder of radius R + k about the axis through sun and planet. k = 0 is the
-    planet's shadow; at the kinks of a profile the column toward the sun has a square-root edge. Only the far side of
-    the planet (mu_s < 0) counts. A disc sets (visible_sun) between the surfaces on which r mu_s = -sqrt(r^2 - R^2) +- R
-    times its radius: those of the shadow about axes moved by so much along the beam.
+    planet's shadow; at the kinks of a profile the column toward the sun has a square-root edge, and at levels.dusk
+    light comes suddenly. Only the far side of the planet (mu_s < 0) counts. A disc sets (visible_sun) between the
+    surfaces on which r mu_s = -sqrt(r^2 - R^2) +- R times its radius: those of the shadow about axes moved by so much
+    along the beam.
     """
     radius, r = optics.radius, optics.radius + rays.h
     a = (1.0 - rays.nu) * (1.0 + rays.nu)
@@ -125,7 +126,8 @@ def _sunlight_edges(optics: Optics, rays: Rays) -> list[Any]:
     disc = [-1.0, 1.0] if optics.atmosphere.sun_angular_radius_deg > 0.0 else []
     sets = [sign * optics.radius * optics.sun_radius for sign in disc]
     own = r * rays.mu
-    for k, moved in [*((parameter(level), None) for level in corners(optics.atmosphere)), *((0.0, by) for by in sets)]:
+    levels = [*corners(optics.atmosphere), *dusk(optics.atmosphere)]
+    for k, moved in [*((parameter(level), None) for level in levels), *((0.0, by) for by in sets)]:
         along = axial if moved is None else axial - moved
         b = own - along * rays.nu
         c = (rays.h - k) * (2.0 * radius + rays.h + k) - along * along
@@ -276,7 +278,7 @@ def march(
     shells = shells or Shells(optics)
     cuts, r_mu = Cuts(optics, rays, sunlit=single, shells=shells), (optics.radius + rays.h) * rays.mu
     rule = shells.rule(nodes or (NODES_AT_STEPS if has_steps(optics.atmosphere) else NODES))
-    phases = {k: optics.phase_values(k, t.Float(rays.nu)) for k in optics.scatterers}
+    phases = {k: optics.phase_values(k, rays.nu) for k in optics.scatterers}
 
     def piece(d: Any, shell: Any, amounts: list[Any], one: list[Any], more: list[Any]) -> tuple[Any, ...]:
         end, shell = cuts.after(d, shell, amounts)

@@ -225,9 +225,11 @@ class Optics:
         return total
 
     def phase_values(self, constituent: int, nu: Any) -> list[Any]:
-        """Phase function (1/sr) of a constituent per channel at the cosine ``nu`` of the scattering angle."""
+        """Phase function (1/sr) of a constituent per channel at the cosine ``nu`` of the scattering angle; peaks in the
+        precision of that: rounded to 6e-8, it moves that of g = 0.99 by 1e-3."""
+        t = types()
         phases, place = self._phases(constituent)
-        values = [p.value(nu) for p in phases]
+        values = [t.Float(p.value(nu if hasattr(p, "g") else t.Float(nu))) for p in phases]
         return [values[i] for i in place]
 
     def phase_function(self, constituent: int) -> Callable[[Any], list[Any]]:

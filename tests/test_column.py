@@ -73,6 +73,37 @@ def test_uniform_density_is_geometry():
     assert np.abs(got - np.exp(-beta * np.array(distance))[:, None]).max() < 2e-6
 
 
+def columns_off(spec: dict, h: np.ndarray, mu: np.ndarray) -> np.ndarray:
+    """Relative errors of the columns toward the sun that the table tells."""
+    from atmo_jit.backend import floats
+    from atmo_jit.column import SunColumns
+    from atmo_jit.optics import Optics
+    from atmo_jit.resolution import Resolution
+
+    air = atmo_jit.Atmosphere.from_dict(spec)
+    columns = SunColumns(Optics(air, np.arange(1)), Resolution.suited(air, 0.01).columns)
+    return np.array(columns.toward(floats(h), floats(mu))[0]) / Twin(spec).columns(h, mu)[:, 0] - 1.0
+
+
+def test_columns_bend_where_density_falls_linearly():
+    """Between rows of the table a line lacks what the slope of density adds, 5e-4 of the column near the top."""
+    profile = {"altitude_m": [0, 2e4, 4e4], "density": [0, 1, 0]}
+    spec = world(rayleigh={"scattering_per_m": 1e-5, "profile": profile}, mie=None)
+    h = np.linspace(2.1e4, 3.9e4, 40)
+    assert np.abs(columns_off(spec, h, 0.0 * h + 1.0)).max() < 2e-5
+
+
+def test_columns_under_a_step_where_shells_are_thin():
+    """Several shells begin inside one cell of the look-up from altitude to shell."""
+    profile = {"altitude_m": [0, 20000], "density": [1, 1]}
+    spec = world(rayleigh={"scattering_per_m": 3e-3, "profile": profile}, mie=None)
+    spec["bottom_radius_m"] += 6e7
+    spec["top_radius_m"] += 6e7
+    depth = np.array([0.05, 0.5, 1.0, 3.0, 10.0, 30.0])
+    h = np.float64(np.float32(20000.0 - depth))
+    assert np.abs(columns_off(spec, h, 0.0 * h)).max() < 1e-2
+
+
 def test_sun_irradiance_of_the_reference_grid(reference):
     """Direct irradiance of a horizontal surface, 5 altitudes, sun to 88 degrees."""
     from bench.accuracy import irradiance
