@@ -51,8 +51,9 @@ RADIUS = Range(0, 1e10, low_open=True)
 FARTHEST_TOP, SMALLEST = 10000.0, 1e-3
 # Every species makes the kernels larger: with this many the first solve takes half a minute, with thousands no end.
 MOST_SPECIES = 64
-# Rays are cut at every altitude of a table: with a thousand a solve takes half a minute, with 200,000 hours.
-MOST_ALTITUDES = 5000
+# Rays are cut at every altitude of a table, and every table is looked up there: with as many a solve takes half a
+# minute, with 200,000 hours.
+MOST_ALTITUDES, MOST_LOOK_UPS = 2000, 20_000
 SCATTERED_FRACTION = Range(1e-12, 1)  # what scatters less has absorption_per_m
 # Columns through denser air, and light of brighter suns, are too much for single precision.
 DENSEST, BRIGHTEST = 1e6, 1e30  # 1/m; W m^-2 nm^-1
@@ -327,12 +328,13 @@ def _constituent(
 def _few_altitudes(constituents: tuple[Constituent, ...]) -> None:
     """Refuse more altitudes in the tables of all profiles together than can be solved for."""
     altitudes: set[float] = set()
-    for c in constituents:
-        if isinstance(c.profile, Tabulated):
-            altitudes.update(c.profile.kinks_m)
-            if len(altitudes) > MOST_ALTITUDES:
-                allowed = f"at most {MOST_ALTITUDES} altitudes in all profiles together"
-                raise AtmosphereError(f"{c.name}.profile.altitude_m", f"a list of {len(c.profile.altitude_m)}", allowed)
+    tabulated = [c for c in constituents if isinstance(c.profile, Tabulated)]
+    most = min(MOST_ALTITUDES, MOST_LOOK_UPS // max(len(tabulated), 1))
+    for c in tabulated:
+        altitudes.update(c.profile.kinks_m)
+        if len(altitudes) > most:
+            allowed = f"at most {most} altitudes in all profiles together"
+            raise AtmosphereError(f"{c.name}.profile.altitude_m", f"a list of {len(c.profile.altitude_m)}", allowed)
 
 
 def _child(node: Any, key: str) -> Any:

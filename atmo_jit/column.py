@@ -37,7 +37,9 @@ from .quadrature import gauss_legendre
 
 NODES_PER_LAYER = 4
 LEAST = 1e-37  # mean density of which a logarithm is made
-LEAST_ROWS = 24  # in a shell, where densities are tabulated: what is above a step is steep in its light
+# Rows in a shell where densities are tabulated: what is above a step is steep in its light. Fewer in many shells.
+LEAST_ROWS, MANY_ROWS = 24, 1536
+MANY_SHELLS = 500  # so thin that two nodes do in each
 _CELLS = 4096  # of the look-up from altitude to shell, uniform in the square root of altitude
 
 
@@ -60,7 +62,8 @@ class SunColumns:
         self._knee, self._log_range = parameter(knee), parameter(np.log1p(1.0 / knee))
         self._shells, self._cosines = len(breaks) - 1, size[1]
         # Intervals per shell. It and their number are parameters: where a level more is cut no kernel is compiled.
-        self._intervals = max(LEAST_ROWS if self._sloping else 4, round(size[0] / self._shells))
+        most = max(1, MANY_ROWS // self._shells)
+        self._intervals = max(min(LEAST_ROWS if self._sloping else 4, most), round(size[0] / self._shells))
         self._rows, self._last = parameter(self._intervals), parameter(self._shells - 1.0)
         edges = np.sqrt(breaks / atmosphere.thickness_m) * _CELLS
         cell_start = np.searchsorted(edges, np.arange(_CELLS + 1), side="right") - 1
@@ -98,7 +101,7 @@ class SunColumns:
         x = t.Float(place) / self._rows
         h = dr.maximum(dr.fma(low - high, x * x, high), low)
         mu = dr.minimum(self._knee * (dr.exp(t.Float(column) / (cosines - 1) * self._log_range) - 1.0), 1.0)
-        totals = column_up(self.optics, h, mu, self._rule)
+        totals = column_up(self.optics, h, mu, self._rule, lane // (cosines * rows))
         path = distance_up(self.optics.radius, h, mu, self.optics.thickness)
         # Where the path has no length: that on this shell's side of the break.
         at_top = self.optics.densities(dr.fma(low - high, dr.maximum(x, 1e-3) ** 2, high))
@@ -238,20 +241,24 @@ def sun_columns(optics: Optics, grid: Grid, table: Any = None, known: Any = None
 
 def integration_rule(optics: Optics) -> tuple[Any, Any]:
     """What column_up integrates by: the altitudes between which profiles are smooth; nodes and weights in between."""
-    return floats(optics.breaks_m), floats(np.column_stack(gauss_legendre(NODES_PER_LAYER)))
+    nodes = NODES_PER_LAYER if len(optics.breaks_m) < MANY_SHELLS else 2
+    return floats(optics.breaks_m), floats(np.column_stack(gauss_legendre(nodes)))
 
 
-def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = None) -> list[Any]:
+def column_up(
+    optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = None, shell: Any = 0
+) -> list[Any]:
     """Column density (m) of every constituent from ``h`` to the top along mu >= 0, by Gauss-Legendre between the
-    profile's breaks. ``rule``: see integration_rule."""
-    t, count = types(), NODES_PER_LAYER
+    profile's breaks. ``rule``: see integration_rule; ``shell``: one that ``h`` is not below."""
+    t = types()
     breaks, nodes = rule or integration_rule(optics)
+    nodes_in_each = dr.opaque(t.UInt, dr.width(nodes) // 2, 1)
     optics = optics.spread(dr.width(h))
 
     # One node per pass, not one layer: a quarter of the code to compile.
     def add(index: Any, totals: list[Any], profiles: list[Any]) -> tuple[Any, list[Any]]:
-        low, high = (dr.maximum(dr.gather(t.Float, breaks, index // count + i), h) for i in (0, 1))
-        node, weight = packet(nodes, index % count, 2)
+        low, high = (dr.maximum(dr.gather(t.Float, breaks, index // nodes_in_each + i), h) for i in (0, 1))
+        node, weight = packet(nodes, index % nodes_in_each, 2)
         start = distance_up(optics.radius, h, mu, low)
         length = distance_up(optics.radius, h, mu, high) - start
         there, _ = altitude_along(optics.radius, h, mu, dr.fma(length, node, start))
@@ -259,7 +266,8 @@ def column_up(optics: Optics, h: Any, mu: Any, rule: tuple[Any, Any] | None = No
         densities = optics.with_values({"profiles": profiles}).densities(there)
         return index + 1, [dr.fma(length, d, total) for d, total in zip(densities, totals, strict=True)]
 
-    last = dr.opaque(t.UInt, count * (dr.width(breaks) - 1), 1)
+    last = nodes_in_each * (dr.opaque(t.UInt, dr.width(breaks), 1) - 1)
     zero = [dr.zeros(t.Float, dr.width(h)) for _ in optics.constituents]
-    _, totals = sum_loop((t.UInt(0), zero), lambda i, _: i < last, add, optics.profiles, "column_up")
+    start = t.UInt(shell) * nodes_in_each, zero
+    _, totals = sum_loop(start, lambda i, _: i < last, add, optics.profiles, "column_up")
     return totals

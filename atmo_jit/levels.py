@@ -11,6 +11,7 @@ from .atmosphere import Atmosphere, Constituent
 from .profile import Exponential, Tabulated, Tent
 
 FEW_CORNERS = 8
+MOST_LEVELS = 2000  # beyond which rays are cut at the corners of profiles alone
 # Scale heights at which rays are cut: the field is asked once between two cuts.
 LEVELS = (0.5, 1.0, 1.75, 2.5, 3.75, 5.0, 9.0, 13.0, 17.0)
 # In fog, more: as long as a horizontal ray there has this optical depth.
@@ -33,6 +34,7 @@ def breaks(atmosphere: Atmosphere) -> np.ndarray:
     levels = [0.0, top]
     radius = atmosphere.bottom_radius_m
     kinks = {k for c in atmosphere.constituents for k in c.profile.kinks_m}
+    finer: set[float] = set()
     for c in atmosphere.constituents:
         extinction = float(np.max(c.extinction_per_m))
         if isinstance(c.profile, Exponential):
@@ -41,8 +43,10 @@ def breaks(atmosphere: Atmosphere) -> np.ndarray:
             if atmosphere.sun_angular_radius_deg > 0.0 and _grazing(atmosphere, c) > DUSK[2]:
                 levels += [part * c.profile.scale_height_m for part in NEAR_GROUND]
         else:
-            kinks.update(_ramp_levels(c.profile, extinction, radius))
-            kinks.update(_under_steps(c, radius))
+            finer.update(_ramp_levels(c.profile, extinction, radius))
+            finer.update(_under_steps(c, radius))
+    if len(kinks) + len(finer) <= MOST_LEVELS:
+        kinks |= finer
     levels += kinks
     # Not np.unique: in its first call it imports all of numpy.ma.
     levels = np.array(sorted(set(np.clip(levels, 0.0, top).tolist())))

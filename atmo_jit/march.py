@@ -211,7 +211,7 @@ class Cuts:
         self._perigee = dr.maximum(perigee_altitude(optics.radius, rays.h, rays.mu), 0.0)
         self._r_mu = (optics.radius + rays.h) * rays.mu
         self._edges = _sunlight_edges(optics, rays) if sunlit else []
-        self._farthest = MAX_TURN * optics.radius
+        self._closest = optics.radius + self._perigee
 
     def first_shell(self) -> Any:
         """The shell that each ray starts in."""
@@ -239,7 +239,10 @@ class Cuts:
         for depth, densest in zip(depths, self._shells.densest(t.UInt(shell), len(depths)), strict=True):
             rate = dr.select(depth < SPENT_DEPTH, dr.maximum(rate, densest), rate)
         longest = MAX_DEPTH / rate
-        limit = d + dr.minimum(longest, self._farthest)
+        # Far out paths of that turn are longer: planets may have thousands of radii of air.
+        along = self._r_mu + d
+        farther = dr.sqrt(dr.fma(along, along, self._closest * self._closest)) - radius
+        limit = d + dr.minimum(longest, MAX_TURN * dr.maximum(radius, farther))
         # The ray ends at the top, whatever the rounding of the crossing says.
         crossing = dr.select(~falling & (shell >= self._last), rays.stop, crossing)
         end = dr.minimum(dr.minimum(dr.maximum(crossing, d), limit), rays.stop)

@@ -368,14 +368,16 @@ def test_altitudes_are_counted(earth):
     def table(first, count):
         return {"altitude_m": [float(first + i) for i in range(count)], "density": [1.0] * count}
 
-    rayleigh = {"scattering_per_m": 1e-5, "profile": table(0, 3000)}
+    rayleigh = {"scattering_per_m": 1e-5, "profile": table(0, 1000)}
     aerosol = {key: value for key, value in earth["mie"].items() if key != "scale_height_m"}
-    fits = earth | {"rayleigh": rayleigh, "mie": aerosol | {"profile": table(1000, 4000)}}
+    fits = earth | {"rayleigh": rayleigh, "mie": aerosol | {"profile": table(500, 1500)}}
     assert len(Atmosphere(fits).constituents) == 3
-    text = str(refusal(fits | {"mie": [aerosol | {"profile": table(1001, 4000)}]}))
+    text = str(refusal(fits | {"mie": [aerosol | {"profile": table(501, 1500)}]}))
     assert text == (
-        "mie.0.profile.altitude_m: found a list of 4000; allowed: at most 5000 altitudes in all profiles together"
+        "mie.0.profile.altitude_m: found a list of 1500; allowed: at most 2000 altitudes in all profiles together"
     )
+    many = [aerosol | {"profile": table(0, count)} for count in (*[10] * 39, 501)]
+    assert "allowed: at most 500 altitudes" in str(refusal(earth | {"mie": many}))
 
 
 def test_hostile_text_stays_on_one_short_line(earth):
