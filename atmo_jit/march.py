@@ -392,9 +392,11 @@ def _largest_extinctions(optics: Optics, breaks: Any) -> Any:
     one of a shell's ends."""
     t = types()
     lower = dr.arange(t.UInt, len(optics.breaks_m) - 1)
-    # A step in a tabulated profile sits on a break, and the density there is the upper side's.
+    # A step in a tabulated profile sits on a break, and the density there is the upper side's; in single precision a
+    # layer far up may be all on one, whose density the empty shell above it has not.
+    sides = (1.0 + 1e-6 if isinstance(breaks, t.Float) else 1.0, 1.0 - 1e-6)
     ends = (dr.gather(type(breaks), breaks, i) for i in (lower, lower + 1))
     low, high = (
-        optics.extinctions(optics.densities(h * side)) for h, side in zip(ends, (1.0, 1.0 - 1e-6), strict=True)
+        optics.extinctions(optics.densities(h * side)) for h, side in zip(ends, sides, strict=True)
     )
     return table_of([dr.maximum(a, b) for a, b in zip(low, high, strict=True)], lower)
