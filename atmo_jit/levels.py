@@ -24,7 +24,7 @@ DUSK, SUDDEN = (20.0, 5.0, 1.25, 0.3, 0.07, 0.015), 1.5e-4
 # While the sun's centre is down its light grazes the ground, and near that changes as the root of the altitude.
 NEAR_GROUND = (0.004, 0.02, 0.1)  # scale heights
 STEEPER = 4.0
-FINEST = 3e-5  # of an altitude: shells, which are divided on, are no thinner in single precision
+FINEST = 3e-6  # of an altitude: shells, which are divided on, are no thinner in single precision
 
 
 def breaks(atmosphere: Atmosphere) -> np.ndarray:

@@ -46,6 +46,7 @@ GRAZING = 1e-6  # planet radii
 # Of the altitude: a ray whose perigee is nearer to the ground grazes it, and whether it meets it is for the rounding of
 # its angle and of the radius to say.
 UNDECIDED = 1e-7
+SETTING = 5e-8  # radians: a sun that is a point counts as a disc of 1e-7
 
 ABOUT = {
     "not finite": "radiance, transmittance, irradiances: values that are NaN or infinite (count)",
@@ -181,6 +182,10 @@ def of_twin(world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[
     altitude, cosine = views["altitude_m"], np.cos(np.radians(views["view_zenith_deg"]))
     perigee = altitude - (twin.radius + altitude) * cosine**2 / (1.0 + np.sqrt(1.0 - cosine**2))
     compared = (altitude < twin.top) & ~((cosine < 0.0) & (np.abs(perigee) < UNDECIDED * altitude))
+    if twin.disc == 0.0:
+        # A point of a sun on the horizon is up or down as the rounding decides.
+        horizon = 0.5 * np.pi + np.arctan2(np.sqrt(altitude * (2.0 * twin.radius + altitude)), twin.radius)
+        compared &= np.abs(np.radians(views["sun_zenith_deg"]) - horizon) > SETTING
     inside = np.flatnonzero(compared)[:TWIN_VIEWS]
     some = {name: values[inside] for name, values in views.items()}
     if not inside.size:

@@ -36,6 +36,9 @@ HALVINGS = 40
 DEEP, LEVELS = 100.0, (1, 2, 3, 4, 6, 8, 10, 13, 16, 20)
 """Scale heights of air from which on rays are cut at these multiples of the scale height too."""
 
+UNDER = (1e-4, 1e-5, 1e-6)
+"""Of its altitude: so far under a step down in density rays are cut."""
+
 
 @dataclass(frozen=True)
 class Species:
@@ -115,11 +118,15 @@ class Twin:
         self.kinks = np.array(
             sorted({kink for s in self.species for kink in s.kinks if 0 < kink < self.top} | {self.top})
         )
+        below, above = 1.0 - 1e-9, 1.0 + 1e-9
         rungs = np.r_[1e-4, 1e-3, (np.arange(LADDER + 1) / LADDER) ** 2.2]
         blocks = [spec.get("rayleigh") or {}, *(m if isinstance(m := spec.get("mie") or [], Sequence) else [m])]
         heights = [block["scale_height_m"] for block in blocks if "scale_height_m" in block]
         levels = [n * height for height in heights for n in LEVELS if self.top > max(DEEP, n) * height]
-        self.ladder = np.unique([*(self.top * rungs), *self.kinks, *levels])
+        # Into the top of a thick layer a low sun shines some millionths of the altitude deep.
+        ends = [k for k in self.kinks if any(s.density(k * below) > s.density(k * above) + 0.01 for s in self.species)]
+        under = [k * (1.0 - part) for k in ends for part in UNDER]
+        self.ladder = np.unique([*(self.top * rungs), *self.kinks, *levels, *under])
         self.view_rule, self.sun_rule = (legendre.leggauss(count) for count in (nodes, sun_nodes))
 
     def _per_wavelength(self, value: ArrayLike) -> Array:
