@@ -74,7 +74,8 @@ class Samples:
 
 class Gather:
     """The step from one order to the next for one atmosphere, along ``directions`` seen at ``azimuths``; the light that
-    it returns has azimuthal orders up to ``most``. ``held``: what another of the same kind made of the atmosphere."""
+    it returns has azimuthal orders up to ``most``. ``held``: what another of the same kind made of the atmosphere;
+    ``like``: one of this atmosphere whose weights serve, if its directions are the same."""
 
     def __init__(
         self,
@@ -86,13 +87,16 @@ class Gather:
         most: int,
         nodes: int,
         held: dict[str, Any] | None = None,
+        like: Gather | None = None,
     ) -> None:
         self.optics, self.grid, self.reference = optics, grid, reference
         self.azimuths, self.most, self.cuts = azimuths, most, True
         key = ("samples", directions, azimuths)
         self.samples = grid.kept(key, lambda: Samples(grid, directions, azimuths))
         self.paths = self.samples.paths
-        if held is None:
+        if held is None and like is not None and like.paths is self.paths:
+            held = {**like.held, "scale": self._reference_at_samples()}
+        elif held is None:
             weights = PathWeights(optics, self.paths, nodes)
             scale = self._reference_at_samples()
             held = {"scattered": weights.scattered, "reflected": weights.reflected, "scale": scale}

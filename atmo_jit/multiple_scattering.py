@@ -319,9 +319,8 @@ class _Steps:
             reference = Reference.above(grid, first) if held is None else Reference.of(grid, first.channels, held)
         later, light, gather = [], first, None
         for n in range(2, count + (tail is None)):
-            if n > 2 and self._stage(n) != self._stage(n - 1):
-                gather = None
-            gather = gather or self._gather(optics, reference, n, None)
+            if gather is None or self._stage(n) != self._stage(n - 1):
+                gather = self._gather(optics, reference, n, None, gather)
             light = self._next(gather, light, n)
             later.append(light.values)
         if tail is not None:
@@ -338,10 +337,12 @@ class _Steps:
         light = self._next(gather, Moments(light, *self._degree(n - 1), suns, optics.channel_count), n)
         return light.values, gather.held
 
-    def _gather(self, optics: Optics, reference: Reference, n: int, held: Any) -> Gather:
+    def _gather(
+        self, optics: Optics, reference: Reference, n: int, held: Any, like: Gather | None = None
+    ) -> Gather:
         stage, r = self._stage(n), self._resolution
         s = r.stages[stage]
-        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.most, r.nodes, held)
+        return Gather(optics, self._grid, reference, self._stages[stage], s.azimuths, s.most, r.nodes, held, like)
 
     def _next(self, gather: Gather, light: Moments, n: int) -> Moments:
         return self._project(n)(gather(light), self._grid.shape[1], light.channels)

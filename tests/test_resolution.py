@@ -40,11 +40,19 @@ def test_thick_air_that_absorbs_needs_fewer_altitudes_than_white_clouds():
     assert altitudes == sorted(altitudes, reverse=True) and altitudes[0] >= altitudes[-1] + 8
 
 
+@pytest.mark.parametrize(("scattering", "stages"), [(4e-6, 2), (1e-4, 1)])
+def test_azimuthal_orders_of_fine_solves(scattering, stages):
+    """Orders above 2 have fewer where aerosols are thin, and only there."""
+    fine = Resolution.suited(EARTH.replace({"mie.scattering_per_m": scattering}), 0.01, fine=True)
+    assert len(fine.stages) == stages
+    assert all(stage.most < fine.stages[0].most and stage.degree == fine.first_degree for stage in fine.stages[1:])
+
+
 def test_fine_solves_have_all_degrees_in_all_orders():
     for changes in ({}, {"mie.scattering_per_m": 1e-4, "mie.phase.g": 0.85}):
         air = EARTH.replace(changes)
         usual, fine = (Resolution.suited(air, 0.01, fine=fine) for fine in (False, True))
-        assert [stage.degree for stage in fine.stages] == [fine.first_degree]
+        assert all(stage.degree == fine.first_degree for stage in fine.stages)
         assert fine.first_degree > usual.first_degree and fine.altitudes > usual.altitudes
         assert fine.stages[0].most == usual.stages[0].most + 2 and fine.twice and not usual.twice
 
