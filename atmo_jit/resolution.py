@@ -27,7 +27,7 @@ FINER = (0.02, 0.005, 0.002)  # tolerances from which on there are more nodes
 # More for derivatives as exact as the light: at least so many degrees and times as many, altitudes, suns.
 FINE_DEGREES, FINE_TIMES, FINE_ALTITUDES, FINE_SUNS = 8, 1.3, 8, 20
 FINE_NEAR_GROUND, FINE_TWILIGHT, FINE_ORDERS = 3.0, 8.0, 2  # see Resolution; azimuthal orders more
-FINE_DIRECTIONS = 14  # at least, to either side of the horizon, less 2 below it
+FINE_DIRECTIONS = 13  # at least, to either side of the horizon, less 2 below it
 # Optical depth of aerosols up to which light that meets them twice needs no more, where there are more than a few.
 CLEAR, FEW_ORDERS = 0.025, 4
 REMEMBERED = 64  # phase functions whose moments are kept

@@ -5,9 +5,9 @@ By every parameter but the radii (whose derivatives are differences themselves),
 200 m above two planets, under suns above and below the horizon. The reference: fourth-order differences of four solves
 each in double precision, all on the same nodes and cut at the same altitudes (those of the atmosphere in the middle,
 and corners of their own), with more altitudes, suns, degrees and azimuthal orders than the linearization has, and the
-field asked for in pieces of rays half as long. In single precision, or where the places at which columns and rays are
-cut move with a scale height, differences are off by up to a fifth of a small derivative. It is made twice, at two such
-resolutions, and what the two differ by is printed beside what the derivatives are off.
+field asked for in pieces of rays a quarter as long. In single precision, or where the places at which columns and rays
+are cut move with a scale height, differences are off by up to a fifth of a small derivative. It is made twice, at two
+such resolutions, and what the two differ by is printed beside what the derivatives are off.
 
 An error is relative to the derivative, or to SMALL of the largest derivative by that parameter among the views of that
 atmosphere and wavelength where it is less than that: a derivative that passes through 0 between two views has no digits
@@ -29,8 +29,10 @@ import numpy as np
 
 VIEWS, NEAR = 20, 4  # directions, and those within a degree of the horizon
 SMALL = 0.05
-STEPS = {"altitude_m": 4.0, "sun_zenith_deg": 0.02, "view_zenith_deg": 0.02, "azimuth_deg": 0.2, "mie.phase.g": 0.004}
+STEPS = {"altitude_m": 20.0, "sun_zenith_deg": 0.2, "view_zenith_deg": 0.02, "azimuth_deg": 0.2, "mie.phase.g": 0.004}
 NARROW = {"single_scattering_albedo": 0.004}  # which ends at 1
+# Look-ups are linear between levels and suns: steps that are wider than these lie apart.
+REFINE, SUN_REFINE = {"altitude_m": 16, "sun_zenith_deg": 4}, {"altitude_m": 4, "sun_zenith_deg": 16}
 STEP = 0.01  # relative, of all others
 TOLERANCE = 3e-4  # of the reference's orders: where the four solves stop after different ones, differences are off
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0))
@@ -76,8 +78,9 @@ def drawn(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, np.ndarra
     return air, views
 
 
-def finer(resolution: Any, altitudes: float, suns: float, degrees: int, orders: int) -> Any:
-    """A resolution with so many times as many altitudes and suns, and so many more degrees and azimuthal orders."""
+def finer(resolution: Any, altitudes: float, suns: float, degrees: int, orders: int, name: str = "") -> Any:
+    """A resolution with so many times as many altitudes and suns, and so many more degrees and azimuthal orders,
+    for differences by a ``name``."""
     from atmo_jit.resolution import FIRST_DEGREES
 
     place = min(FIRST_DEGREES.index(resolution.first_degree) + degrees, len(FIRST_DEGREES) - 1)
@@ -97,8 +100,8 @@ def finer(resolution: Any, altitudes: float, suns: float, degrees: int, orders: 
         resolution,
         altitudes=int(altitudes * resolution.altitudes),
         suns=int(suns * resolution.suns),
-        refine=6,
-        sun_refine=8,
+        refine=REFINE.get(name, 6),
+        sun_refine=SUN_REFINE.get(name, 8),
         near_ground=NEAR_GROUND,
         stages=stages,
         nodes=4,
@@ -147,8 +150,10 @@ def cut_alike(air: Any) -> Iterator[None]:
         levels.breaks, column.thinnest = before
 
 
-def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], resolution: Any) -> dict[str, np.ndarray]:
-    """Derivatives of the radiance [N, W] by name."""
+def differences(
+    air: Any, views: dict[str, np.ndarray], names: Sequence[str], resolution: Any, by: tuple[float, float, int, int]
+) -> dict[str, np.ndarray]:
+    """Derivatives of the radiance [N, W] by name, at a resolution ``by`` so much finer."""
     import drjit as dr
 
     from atmo_jit import Atmosphere, Sky
@@ -160,7 +165,8 @@ def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], re
     suns = float(sun.min() - 0.01), float(sun.max() + 0.01)
 
     def light(there: Atmosphere, where: dict[str, np.ndarray]) -> np.ndarray:
-        sky = Sky(there, tolerance=TOLERANCE, resolution=resolution, suns=suns, layout=air, sure=True, fine=True)
+        how = {"tolerance": TOLERANCE, "resolution": finer(resolution, *by, name), "suns": suns}
+        sky = Sky(there, layout=air, sure=True, fine=True, **how)
         angles = [doubles(np.radians(where[n])) for n in ("sun_zenith_deg", "view_zenith_deg", "azimuth_deg")]
         place = doubles(where["altitude_m"]), *angles
         rays, _, _ = sky.enter(*place)
@@ -170,7 +176,7 @@ def differences(air: Any, views: dict[str, np.ndarray], names: Sequence[str], re
         return np.stack([v.numpy() for v in found], axis=-1).astype(float)
 
     found = {}
-    with double_precision(), shorter_pieces(), cut_alike(air):
+    with double_precision(), shorter_pieces(), shorter_pieces(), cut_alike(air):
         for name in names:
             if name in views:
                 step = STEPS[name]
@@ -194,7 +200,7 @@ def compared(seed: int, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
     at = Linearization(air, views, fine=True)
     names = names or [n for n in parameter_names(air, views) if n not in (*RADII, "sun_angular_radius_deg")]
     ours = at.jacobian(names)
-    coarser, truth = (differences(air, views, names, finer(at.sky.resolution, *by)) for by in (COARSER, FINER))
+    coarser, truth = (differences(air, views, names, at.sky.resolution, by) for by in (COARSER, FINER))
     near = np.broadcast_to(views["view_zenith_deg"][:, None] >= 89.0, (VIEWS, 3))
     found = {}
     for name in names:
