@@ -125,8 +125,11 @@ def _stacked(values: list[Any], like: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(v.numpy(), like.shape) for v in values], axis=-1).astype(float)
 
 
-def check_world(world: Mapping[str, Any], views: dict[str, np.ndarray], twin: Any, *, solves: bool) -> Errors:
-    """Errors by quantity in one atmosphere. ``solves``: those too that need it solved several times."""
+def check_world(
+    world: Mapping[str, Any], views: dict[str, np.ndarray], twin: Any, *, solves: bool, compared: int = TWIN_VIEWS
+) -> Errors:
+    """Errors by quantity in one atmosphere. ``solves``: those too that need it solved several times; ``compared``: so
+    many views are with the twin."""
     solved = Solved(world)
     arrays = [*solved.rays(views), *solved.irradiances(views)]
     errors: Errors = {
@@ -135,7 +138,7 @@ def check_world(world: Mapping[str, Any], views: dict[str, np.ndarray], twin: An
         "transmittance above 1": np.maximum(arrays[1] - 1.0, 0.0),
     }
     errors |= _along(world, views, solved, arrays[0])
-    errors |= of_twin(world, views, arrays, twin)
+    errors |= of_twin(world, views, arrays, twin, compared)
     if solves:
         errors |= _of_solves(world, views, arrays[0])
     return errors
@@ -177,8 +180,10 @@ def _along(world: Mapping[str, Any], views: dict[str, np.ndarray], solved: Solve
     }
 
 
-def of_twin(world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[np.ndarray], twin: Any) -> Errors:
-    """Differences from the quadrature twin, in double precision."""
+def of_twin(
+    world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[np.ndarray], twin: Any, count: int = TWIN_VIEWS
+) -> Errors:
+    """Differences from the quadrature twin, in double precision, of the first ``count`` views that can be compared."""
     altitude, cosine = views["altitude_m"], np.cos(np.radians(views["view_zenith_deg"]))
     perigee = altitude - (twin.radius + altitude) * cosine**2 / (1.0 + np.sqrt(1.0 - cosine**2))
     compared = (altitude < twin.top) & ~((cosine < 0.0) & (np.abs(perigee) < UNDECIDED * altitude))
@@ -186,7 +191,7 @@ def of_twin(world: Mapping[str, Any], views: dict[str, np.ndarray], found: list[
         # A point of a sun on the horizon is up or down as the rounding decides.
         horizon = 0.5 * np.pi + np.arctan2(np.sqrt(altitude * (2.0 * twin.radius + altitude)), twin.radius)
         compared &= np.abs(np.radians(views["sun_zenith_deg"]) - horizon) > SETTING
-    inside = np.flatnonzero(compared)[:TWIN_VIEWS]
+    inside = np.flatnonzero(compared)[:count]
     some = {name: values[inside] for name, values in views.items()}
     if not inside.size:
         return {}
@@ -257,18 +262,21 @@ def sweep(
     per_world: int = PER_WORLD,
     advance: Callable[[float], None] | None = None,
     jobs: int = 1,
+    compared: int = TWIN_VIEWS,
 ) -> Tally:
-    """``pairs`` of atmosphere and view, from the atmosphere of number ``first`` on; ``jobs``: processes."""
+    """``pairs`` of atmosphere and view, from the atmosphere of number ``first`` on; ``jobs``: processes; ``compared``:
+    views of each atmosphere that the twin integrates."""
     count = -(-pairs // per_world)
-    return _each(partial(_of_views, per_world=per_world), range(first, first + count), Tally(), advance, jobs)
+    errors_of = partial(_of_views, per_world=per_world, compared=compared)
+    return _each(errors_of, range(first, first + count), Tally(), advance, jobs)
 
 
-def _of_views(number: int, per_world: int) -> Errors:
+def _of_views(number: int, per_world: int, compared: int) -> Errors:
     rng = Random(number)
     world = extreme_world(rng)
     views = extreme_views(rng, world, per_world)
     twin = load_twins().Twin(world, tolerance=TWIN_TOLERANCE)
-    return check_world(world, views, twin, solves=number % SOLVES_EVERY == 0)
+    return check_world(world, views, twin, solves=number % SOLVES_EVERY == 0, compared=compared)
 
 
 def sweep_derivatives(
@@ -326,13 +334,14 @@ def main() -> int:
     parser.add_argument("--derivatives", type=int, default=2_000, help="by a parameter (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first atmosphere (default: %(default)s)")
     parser.add_argument("--per-world", type=int, default=PER_WORLD, help="views of each (default: %(default)s)")
+    parser.add_argument("--twin", type=int, default=TWIN_VIEWS, help="of them with the twin (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--markdown", type=Path, help="page whose table is replaced by this one")
     options = parser.parse_args()
     start = time.perf_counter()
     page = check_output(options.markdown, ".md") if options.markdown else None
     with progress_bar("pairs") as advance:
-        tally = sweep(options.pairs, options.first, options.per_world, advance, options.jobs)
+        tally = sweep(options.pairs, options.first, options.per_world, advance, options.jobs, options.twin)
     with progress_bar("derivatives") as advance:
         sweep_derivatives(options.derivatives, options.first, tally, advance, options.jobs)
     print(table(tally))
