@@ -16,19 +16,18 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .backend import evaluated, floats, packet, padded, row, row_size, stored, table, types, uints
+from .backend import evaluated, packet, padded, row_size, stored, table, types, uints
 from .column import SunColumns
 from .geometry import safe_sine
 from .grid import Grid
 from .harmonics import Harmonics, pair_count, pair_index, pairs, recurrence
 from .look_ups import LookUps
 from .optics import Optics
-from .paths import lagrange
+from .pair_sums import sums_of_pairs
 from .phase import RayleighPhase
-from .refinement import Reference, Taps
+from .refinement import Reference, Taps, between_levels
 from .slopes import steep_nodes
 from .total import parity
-from .transposed import multilinear
 
 SMOOTH = 2  # degree of the phase function of air: beyond it only aerosols scatter
 
@@ -109,7 +108,7 @@ class Field:
         t, grid, channels = types(), self.grid, self.optics.channel_count
         suns, entries = len(grid.first_theta), 1 if degree is None else pair_count(degree)
         row_length = suns * entries * channels
-        values = _between_levels(grid, values, row_length)
+        values = between_levels(grid, values, row_length)
         lane = dr.arange(t.UInt, grid.level_count * grid.sources * entries)
         entry, node = lane % entries, lane // entries
         source, level = node % grid.sources, node // grid.sources
@@ -185,7 +184,7 @@ class Field:
         """The reference at refined levels, interpolated in its logarithm."""
         logs = dr.log(dr.maximum(self.reference.fine, 1e-37))
         dr.eval(logs)
-        guide = dr.exp(_between_levels(self.grid, logs, dr.width(logs) // self.grid.shape[0]))
+        guide = dr.exp(between_levels(self.grid, logs, dr.width(logs) // self.grid.shape[0]))
         dr.eval(guide)
         return guide
 
@@ -262,41 +261,14 @@ class Field:
                 for step, of_step in zip((mu - basis.mu, x - basis.x), slopes, strict=False):
                     found = [dr.fma(step, slope, value) for slope, value in zip(of_step, found, strict=True)]
             else:
-                found = self._looked_up(degree, count, nodes, weights, basis, moments, phases, recurrences, active)
+                tables = moments, phases, recurrences
+                (found,) = sums_of_pairs(degree, (channels, count), [(nodes, weights)], basis, *tables, active)
             for i, n in enumerate(members):
                 total[n * channels : (n + 1) * channels] = found[i * channels : (i + 1) * channels]
         if self._steep(h, mu_s):
             total = [a + b for a, b in zip(total, self._moved(h, mu_s, basis, active), strict=True)]
         solar = self.optics.spread(width).solar
         return [[e * v for e, v in zip(solar, total[n * channels :], strict=False)] for n in range(kinds)]
-
-    def _looked_up(
-        self,
-        degree: int,
-        kinds: int,
-        nodes: list[Any],
-        weights: list[list[Any]],
-        basis: Harmonics,
-        moments: Any,
-        phases: Any,
-        recurrences: Any,
-        active: Any,
-    ) -> list[Any]:
-        """What look_ups.LookUps sums, without derivatives."""
-        t, channels, width = types(), self.optics.channel_count, dr.width(nodes[0])
-        stride = dr.opaque(t.UInt, pair_count(degree), 1)
-
-        def pair(i: Any, state: Any, sums: list[Any]) -> tuple[Any, ...]:
-            (value,), state = basis.next(packet(recurrences, i, 4, active), state)
-            corner = [packet(moments, node * stride + i, padded(channels), active) for node in nodes]
-            moment = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
-            chi = row(phases, i, kinds * channels, active=active)
-            light = [chi[n] * moment[n % channels] for n in range(kinds * channels)]
-            return i + 1, state, [dr.fma(value, part, s) for part, s in zip(light, sums, strict=True)]
-
-        sums = [dr.zeros(t.Float, width) for _ in range(kinds * channels)]
-        state = (t.UInt(0), basis.start(width), sums)
-        return dr.while_loop(state, lambda i, *_: i < stride, pair, label="scattered")[-1]
 
     def _steep(self, h: Any, mu_s: Any) -> bool:
         """Whether derivatives by a place or sun, of a fine solve, pass through look-ups there."""
@@ -310,90 +282,12 @@ class Field:
         basis = Harmonics(basis.mu, basis.x, slopes=False)
         for (degree, members), tables in zip(self._groups, self._tables, strict=True):
             with dr.suspend_grad():
-                flat = self._slopes(degree, len(members), parts, basis, *(dr.detach(v) for v in tables), active)
+                tables = [dr.detach(v) for v in tables]
+                flat = sums_of_pairs(degree, (channels, len(members)), parts, basis, *tables, active)
+                dr.eval(flat)
             for step, of_step in zip(moved, flat, strict=True):
                 for i, n in enumerate(members):
                     for c in range(channels):
                         place = n * channels + c
                         total[place] = dr.fma(step, of_step[i * channels + c], total[place])
         return total
-
-    def _slopes(
-        self,
-        degree: int,
-        kinds: int,
-        parts: list[tuple[list[Any], list[list[Any]]]],
-        basis: Harmonics,
-        moments: Any,
-        phases: Any,
-        recurrences: Any,
-        active: Any,
-    ) -> list[list[Any]]:
-        """The sums over pairs for each of the ``parts``, nodes and their weights, evaluated."""
-        t, channels, width = types(), self.optics.channel_count, dr.width(basis.mu)
-        stride = dr.opaque(t.UInt, pair_count(degree), 1)
-
-        def pair(i: Any, state: Any, sums: list[list[Any]]) -> tuple[Any, ...]:
-            (value,), state = basis.next(packet(recurrences, i, 4, active), state)
-            chi = row(phases, i, kinds * channels, active=active)
-            new, size = [], padded(channels)
-            for (nodes, weights), old in zip(parts, sums, strict=True):
-                corner = [packet(moments, node * stride + i, size, active, alone=True) for node in nodes]
-                slope = [_blend([w[c] for w in weights], [v[c] for v in corner]) for c in range(channels)]
-                new.append([dr.fma(value, chi[n] * slope[n % channels], s) for n, s in enumerate(old)])
-            return i + 1, state, new
-
-        sums = [[dr.zeros(t.Float, width) for _ in range(kinds * channels)] for _ in parts]
-        state = (t.UInt(0), basis.start(width), sums)
-        *_, slopes = dr.while_loop(state, lambda i, *_: i < stride, pair, label="slopes")
-        dr.eval(slopes)
-        return slopes
-
-
-def _blend(weights: list[Any], values: list[Any]) -> Any:
-    total = weights[0] * values[0]
-    for weight, value in zip(weights[1:], values[1:], strict=True):
-        total = dr.fma(weight, value, total)
-    return total
-
-
-def _between_levels(grid: Grid, values: Any, length: int) -> Any:
-    """[K, length] -> [levels, length]: by the polynomial in the altitude coordinate through four nodes, or six where
-    derivatives are wanted."""
-    t, nodes = types(), grid.shape[0]
-    count = min(6 if grid.resolution.twice else 4, nodes)
-
-    def taps() -> tuple[Any, Any, Any]:
-        level = np.arange(grid.level_count) / grid.refine
-        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, nodes - count)
-        weights = lagrange((first[:, None] + np.arange(count)).astype(float), level)
-        # Levels that read a node are consecutive.
-        readers = np.searchsorted(first, [np.arange(nodes) - count + 1, np.arange(nodes) + 1])
-        return uints(first), floats(weights), uints(readers.T)
-
-    first, weights, readers = grid.kept("between levels", taps)
-
-    def at_levels(values: Any) -> Any:
-        lane = dr.arange(t.UInt, grid.level_count * length)
-        level, place = lane // length, lane % length
-        start, total = dr.gather(t.UInt, first, level), 0.0
-        for i in range(count):
-            value = dr.gather(t.Float, values, (start + i) * length + place)
-            total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
-        return evaluated(total)
-
-    def transposed(grad: Any, *_: Any) -> Any:
-        lane = dr.arange(t.UInt, nodes * length)
-        node, place = lane // length, lane % length
-        start, stop = packet(readers, node, 2)
-
-        def add(level: Any, total: Any) -> tuple[Any, Any]:
-            weight = dr.gather(t.Float, weights, level * count + node - dr.gather(t.UInt, first, level))
-            return level + 1, dr.fma(weight, dr.gather(t.Float, grad, level * length + place), total)
-
-        state = start, dr.zeros(t.Float, dr.width(lane))
-        total = dr.while_loop(state, lambda level, _: level < stop, add, max_iterations=-1, label="between levels")[1]
-        dr.eval(total)
-        return total
-
-    return multilinear(at_levels, transposed, values)

@@ -9,10 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
-from .backend import packet, row, row_size, stored, types
+from .backend import evaluated, floats, packet, row, row_size, stored, types, uints
 from .grid import Grid
+from .paths import lagrange
 from .projection import Moments
+from .transposed import multilinear
 
 FINE = 16  # parts of an interval of solved suns; 1.2 e-folds over it are then linear to 0.1 %
 STEEPEST = 1.2  # e-folds of the reference from one solved sun to the next
@@ -143,3 +146,45 @@ def quintic(f: Any) -> list[Any]:
             product = product * below[i] if i != skipped else product
         weights.append(product)
     return weights
+
+
+def between_levels(grid: Grid, values: Any, length: int) -> Any:
+    """[K, length] -> [levels, length]: by the polynomial in the altitude coordinate through four nodes, or six where
+    derivatives are wanted."""
+    t, nodes = types(), grid.shape[0]
+    count = min(6 if grid.resolution.twice else 4, nodes)
+
+    def taps() -> tuple[Any, Any, Any]:
+        level = np.arange(grid.level_count) / grid.refine
+        first = np.clip(np.floor(level).astype(int) + 1 - count // 2, 0, nodes - count)
+        weights = lagrange((first[:, None] + np.arange(count)).astype(float), level)
+        # Levels that read a node are consecutive.
+        readers = np.searchsorted(first, [np.arange(nodes) - count + 1, np.arange(nodes) + 1])
+        return uints(first), floats(weights), uints(readers.T)
+
+    first, weights, readers = grid.kept("between levels", taps)
+
+    def at_levels(values: Any) -> Any:
+        lane = dr.arange(t.UInt, grid.level_count * length)
+        level, place = lane // length, lane % length
+        start, total = dr.gather(t.UInt, first, level), 0.0
+        for i in range(count):
+            value = dr.gather(t.Float, values, (start + i) * length + place)
+            total = dr.fma(dr.gather(t.Float, weights, level * count + i), value, total)
+        return evaluated(total)
+
+    def transposed(grad: Any, *_: Any) -> Any:
+        lane = dr.arange(t.UInt, nodes * length)
+        node, place = lane // length, lane % length
+        start, stop = packet(readers, node, 2)
+
+        def add(level: Any, total: Any) -> tuple[Any, Any]:
+            weight = dr.gather(t.Float, weights, level * count + node - dr.gather(t.UInt, first, level))
+            return level + 1, dr.fma(weight, dr.gather(t.Float, grad, level * length + place), total)
+
+        state = start, dr.zeros(t.Float, dr.width(lane))
+        total = dr.while_loop(state, lambda level, _: level < stop, add, max_iterations=-1, label="between levels")[1]
+        dr.eval(total)
+        return total
+
+    return multilinear(at_levels, transposed, values)
