@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -62,9 +63,10 @@ def give_back() -> None:
     glibc's heap, half as much as all arrays of a solve and its derivatives."""
     dr.sync_thread()
     dr.flush_malloc_cache()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    if sys.platform == "linux":  # Windows has no library of the process itself
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:  # musl has none
+            trim(0)
 
 
 def copied(tree: Any) -> Any:
